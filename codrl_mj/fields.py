@@ -1,4 +1,4 @@
-"""Fields of frozen dataclasses that know their own bounds and units: the one place where settings are checked."""
+"""Dataclass fields with bounds and units; all settings are validated here."""
 
 import ast
 import dataclasses
@@ -21,259 +21,286 @@ from typing import Any
 def real(
     default: float | None,
     above: float | None = None,
-    least: float | None = None,
+    minimum: float | None = None,
     below: float | None = None,
-    most: float | None = None,
+    maximum: float | None = None,
     optional: bool = False,
     unit: str = "",
     infinite: bool = False,
 ) -> Any:
-    """A field for a finite number within bounds, stored as a float.
+    """Return a field for a finite number within bounds, stored as a float.
 
     Args:
-        default: its default.
-        above: it must be greater than this.
-        least: it must be at least this.
-        below: it must be less than this.
-        most: it must be at most this.
-        optional: let it be None; so does a default of None.
-        unit: for tables and documentation.
-        infinite: let it be infinite.
+        default: default value.
+        above: exclusive lower bound.
+        minimum: inclusive lower bound.
+        below: exclusive upper bound.
+        maximum: inclusive upper bound.
+        optional: allow None; a default of None does so, too.
+        unit: unit, for tables and documentation.
+        infinite: allow infinity.
     """
-    limits = [("> ", above), (">= ", least), ("< ", below), ("<= ", most)]
+    limits = [("> ", above), (">= ", minimum), ("< ", below), ("<= ", maximum)]
     kind = "a number" if infinite else "a finite number"
     text = " ".join(
         [kind, " and ".join(f"{sign}{limit:g}" for sign, limit in limits if limit is not None)]
     ).strip()
 
-    def holds(value: Any) -> bool:
+    def is_valid(value: Any) -> bool:
         return (
             _is_real(value, infinite)
             and (above is None or value > above)
-            and (least is None or value >= least)
+            and (minimum is None or value >= minimum)
             and (below is None or value < below)
-            and (most is None or value <= most)
+            and (maximum is None or value <= maximum)
         )
 
     low, high = (
         next((limit for limit in pair if limit is not None), None)
-        for pair in ((above, least), (below, most))
+        for pair in ((above, minimum), (below, maximum))
     )
-    return _bounded(default, holds, text, optional, unit, float, (low, high))
+    return _bounded(default, is_valid, text, optional, unit, float, (low, high))
 
 
 def integer(
-    default: int | None, least: int, optional: bool = False, unit: str = "", most: float = math.inf
+    default: int | None,
+    minimum: int,
+    optional: bool = False,
+    unit: str = "",
+    maximum: float = math.inf,
 ) -> Any:
-    """A field for an integer of at least `least`; `optional`, or a default of None, lets it be None."""
+    """Return a field for an integer >= `minimum`.
+
+    None is allowed with `optional` or a default of None.
+    """
     return _bounded(
         default,
-        lambda value: _is_integer(value) and least <= value <= most,
-        f"an integer >= {least}" if most == math.inf else f"an integer from {least} to {most}",
+        lambda value: _is_integer(value) and minimum <= value <= maximum,
+        f"an integer >= {minimum}"
+        if maximum == math.inf
+        else f"an integer from {minimum} to {maximum}",
         optional,
         unit,
         int,
-        (least, None),
+        (minimum, None),
     )
 
 
 def flag(default: bool) -> Any:
-    """A field for True or False."""
+    """Return a field for True or False."""
     return _bounded(default, lambda value: isinstance(value, bool), "true or false")
 
 
 def choice(default: str, *options: str) -> Any:
-    """A field for one of some words; where it has to be a number, its place among them."""
-    made = _bounded(default, lambda value: value in options, f"one of {', '.join(options)}")
-    return dataclasses.field(default=default, metadata={**made.metadata, "options": options})
+    """Return a field for one of several words, which arrays represent by their index."""
+    field = _bounded(default, lambda value: value in options, f"one of {', '.join(options)}")
+    return dataclasses.field(default=default, metadata={**field.metadata, "options": options})
 
 
-def units(default: tuple[int, ...]) -> Any:
-    """A field for the units of a network's hidden layers."""
+def positive_integers(default: tuple[int, ...]) -> Any:
+    """Return a field for a tuple of positive integers, such as the sizes of hidden layers."""
 
-    def holds(value: Any) -> bool:
+    def is_valid(value: Any) -> bool:
         return isinstance(value, tuple) and all(
             _is_integer(count) and count >= 1 for count in value
         )
 
-    return _bounded(default, holds, "a tuple of integers >= 1")
+    return _bounded(default, is_valid, "a tuple of integers >= 1")
 
 
-def factors(default: tuple[float, ...] | None = None) -> Any:
-    """An optional field for finite numbers > 0, one for each entry of something."""
+def positive_reals(default: tuple[float, ...] | None = None) -> Any:
+    """Return an optional field for a tuple of finite numbers > 0."""
 
-    def holds(value: Any) -> bool:
-        return isinstance(value, tuple) and all(_is_real(factor) and factor > 0 for factor in value)
+    def is_valid(value: Any) -> bool:
+        return isinstance(value, tuple) and all(_is_real(number) and number > 0 for number in value)
 
-    return _bounded(default, holds, "a tuple of finite numbers > 0")
+    return _bounded(default, is_valid, "a tuple of finite numbers > 0")
 
 
 def reals(default: tuple[float, ...] | None = None) -> Any:
-    """An optional field for finite numbers, one for each entry of something."""
+    """Return an optional field for a tuple of finite numbers."""
 
-    def holds(value: Any) -> bool:
-        return isinstance(value, tuple) and all(_is_real(one) for one in value)
+    def is_valid(value: Any) -> bool:
+        return isinstance(value, tuple) and all(_is_real(number) for number in value)
 
-    return _bounded(default, holds, "a tuple of finite numbers")
+    return _bounded(default, is_valid, "a tuple of finite numbers")
 
 
 @dataclasses.dataclass(frozen=True)
 class Checked:
-    """Base of dataclasses whose fields are made with the functions above.
+    """Base of dataclasses whose fields are validated, made with the functions above.
 
     Raises:
-        ValueError: a field is out of bounds; the message names it, its value and the bound.
+        ValueError: a field is out of bounds; the message has its name, its value and the bound.
     """
 
     def __post_init__(self) -> None:
-        """Refuse a field out of bounds, and store numbers as Python's own."""
+        """Raise if a field is out of bounds; convert numbers to Python's own types."""
         for field in dataclasses.fields(self):
             if "bound" not in field.metadata:
                 continue
-            holds, text, optional, kind = field.metadata["bound"]
+            is_valid, text, optional, kind = field.metadata["bound"]
             value = getattr(self, field.name)
             if value is None and optional:
                 continue
-            if not holds(value):
-                none = " or none" if optional else ""
+            if not is_valid(value):
+                or_none = " or none" if optional else ""
                 raise ValueError(
-                    f"{type(self).__name__}.{field.name} = {value!r}: must be {text}{none}"
+                    f"{type(self).__name__}.{field.name} = {value!r}: must be {text}{or_none}"
                 )
+            # Frozen dataclasses reject plain assignment. NumPy's numbers are converted so that
+            # settings can be serialized.
             if kind is not None:
                 object.__setattr__(self, field.name, kind(value))
 
 
 def free_memory() -> int | None:
-    """Return the memory [bytes] that is free; None where the system does not say, as others than Linux."""
+    """Return the free memory [bytes]; None if the system, unlike Linux, does not report it."""
     meminfo = Path("/proc/meminfo")
     free = re.search(r"MemAvailable:\s*(\d+) kB", meminfo.read_text() if meminfo.exists() else "")
     return 1024 * int(free[1]) if free else None
 
 
-def check_memory(size: float, what: str, remedy: str) -> None:
-    """Refuse what takes more memory than is free.
+def check_memory(size: float, purpose: str, remedy: str) -> None:
+    """Raise if something takes more memory than is free.
 
     Args:
-        size: of the memory [bytes].
-        what: it is for, with how many, for the message.
-        remedy: what to change.
+        size: required memory [bytes].
+        purpose: its purpose, with a number, for the message.
+        remedy: setting to change.
     """
-    if (room := free_memory()) is not None and size > room:
+    if (available := free_memory()) is not None and size > available:
         raise ValueError(
-            f"{what}: about {size / 1e9:,.3g} GB of memory, of which {room / 1e9:.3g} are free;"
-            f" {remedy}"
+            f"{purpose}: about {size / 1e9:,.3g} GB of memory, of which {available / 1e9:.3g} are"
+            f" free; {remedy}"
         )
 
 
 def check_names(
-    given: Iterable[Any],
+    names: Iterable[Any],
     known: Iterable[str],
-    what: str,
+    label: str,
     prefix: str = "",
-    every: bool = False,
+    list_all: bool = False,
     listed_by: str = "",
-    inner: Iterable[str] = (),
+    nested: Iterable[str] = (),
 ) -> None:
-    """Refuse names that are not known; the nearest known ones are suggested.
+    """Raise if a name is unknown; the message suggests the nearest known names.
 
     Args:
-        given: the names.
-        known: what they may be.
-        what: what to call them, such as `actuator field`.
-        prefix: stands before each of them in the message.
-        every: list the known ones beside the nearest, too: for names that somebody else has for the
-            same.
-        listed_by: the command that lists them, where they are many.
-        inner: dotted names of what is in their parts, to be suggested to whoever leaves the part
-            out.
+        names: names to check.
+        known: known names.
+        label: kind of name, such as `actuator field`.
+        prefix: text before each name in the message.
+        list_all: list all known names in addition to the nearest ones, for names that other
+            programs also have, with other spellings.
+        listed_by: command that lists the known names if there are many.
+        nested: dotted names of nested fields, suggested if the name of a part was omitted.
     """
-    known, inner = list(known), list(inner)
-    for name in given:
+    known, nested = list(known), list(nested)
+    for name in names:
         if name not in known:
-            near = [one for one in inner if one.rpartition(".")[2] == name][:3] or _nearest(
-                name, known
-            )
-            near = near or _nearest(name, inner)
+            near = [
+                nearest_name for nearest_name in nested if nearest_name.rpartition(".")[2] == name
+            ][:3] or _nearest(name, known)
+            near = near or _nearest(name, nested)
             hints = (
-                [f"did you mean {' or '.join(f'{prefix}{one}' for one in near)}?"] if near else []
+                [f"did you mean {' or '.join(f'{prefix}{nearest_name}' for nearest_name in near)}?"]
+                if near
+                else []
             )
-            if every or not near:
+            if list_all or not near:
                 hints.append(
                     f"`{listed_by}` lists the known ones"
                     if listed_by
                     else f"known: {', '.join(known)}"
                 )
-            raise ValueError(f"unknown {what} {prefix}{name}; {' '.join(hints)}")
+            raise ValueError(f"unknown {label} {prefix}{name}; {' '.join(hints)}")
 
 
-def leaves(mapping: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """What nested mappings hold, by dotted names."""
-    found: dict[str, Any] = {}
+def flatten(mapping: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values in nested mappings by dotted names."""
+    values: dict[str, Any] = {}
     for key, value in mapping.items():
-        found |= (
-            leaves(value, f"{prefix}{key}.")
+        values |= (
+            flatten(value, f"{prefix}{key}.")
             if isinstance(value, Mapping)
             else {f"{prefix}{key}": value}
         )
-    return found
+    return values
 
 
-def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """What two mappings have otherwise, by dotted names: both values, `absent` where one has none."""
-    mine, others = leaves(one), leaves(other)
+def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Return the values in which two mappings differ, by dotted names.
+
+    Each is a pair; `absent` stands for a missing value.
+    """
+    first_values, second_values = flatten(first), flatten(second)
     pairs = {
-        name: (mine.get(name, "absent"), others.get(name, "absent")) for name in [*mine, *others]
+        name: (first_values.get(name, "absent"), second_values.get(name, "absent"))
+        for name in [*first_values, *second_values]
     }
+    # Values are compared as text, because NaN does not equal itself, and 1 equals True.
     return {name: pair for name, pair in pairs.items() if repr(pair[0]) != repr(pair[1])}
 
 
 def check_pattern(pattern: str) -> None:
-    """Refuse what is no regular expression of names."""
+    """Raise if a text is not a regular expression for names."""
     try:
         re.compile(pattern)
     except (re.error, TypeError) as error:
         raise ValueError(
-            f"{pattern!r}: must be a regular expression ({error}); '.*' is any name, 'leg.*' those"
-            " of a leg"
+            f"{pattern!r}: must be a regular expression ({error}); '.*' matches any name, 'leg.*'"
+            " those of a leg"
         ) from None
 
 
 def check_joint_dynamics(value: Any) -> None:
-    """Refuse what `joint_dynamics` of `codrl_mj.add_motors` cannot be."""
+    """Raise if a value is not valid for `joint_dynamics` of `codrl_mj.add_motors`."""
     if value not in (None, "keep", "replace"):
         raise ValueError(
-            f"joint_dynamics = {value!r}: must be keep or replace; None keeps, and warns"
+            f"joint_dynamics = {value!r}: must be keep or replace; None keeps and warns"
         )
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """A question with the nearest known names and a space, for the message about an unknown one; or nothing."""
+    """Return a question that suggests the nearest known names, or an empty text."""
     near = _nearest(name, known)
     return f"did you mean {' or '.join(map(repr, near))}? " if near else ""
 
 
 def _nearest(name: object, known: Iterable[str]) -> list[str]:
-    """Return the few names that begin with a name or have all of its words, or else the one that is most like it.
+    """Return the few names that begin with a name or contain all of its words, or the closest one.
 
-    Of dotted names only the last parts are compared where the parts before it are known: what two
-    names begin with alike makes them no more similar.
+    Of dotted names only the last parts are compared if the parts before them are known: a common
+    beginning does not make two names more similar.
     """
-    text, spelt = str(name).lower(), {one.lower(): one for one in known}
-    begun = [spelt[one] for one in spelt if len(text) > 2 and one.startswith(text)]
-    if 0 < len(begun) < 4:
-        return begun
-    start, dot, last = text.rpartition(".")
-    ends = {one[len(start + dot) :]: one for one in spelt if dot and one.startswith(start + dot)}
-    if not ends:
-        ends, last = {one: one for one in spelt}, text
-    words = _words(last)
-    same = [
-        spelt[one] for end, one in ends.items() if words and words <= _words(end.rpartition(".")[2])
+    text, spelt = str(name).lower(), {known_name.lower(): known_name for known_name in known}
+    with_prefix = [
+        spelt[known_name] for known_name in spelt if len(text) > 2 and known_name.startswith(text)
     ]
-    if 0 < len(same) < 4:
-        return same
-    beside = [end for end in ends if last == text or "." not in end]
-    return [spelt[ends[one]] for one in difflib.get_close_matches(last, beside, n=1)]
+    if 0 < len(with_prefix) < 4:
+        return with_prefix
+    start, dot, last = text.rpartition(".")
+    ends = {
+        known_name[len(start + dot) :]: known_name
+        for known_name in spelt
+        if dot and known_name.startswith(start + dot)
+    }
+    if not ends:
+        ends, last = {known_name: known_name for known_name in spelt}, text
+    words = _words(last)
+    with_same_words = [
+        spelt[known_name]
+        for end, known_name in ends.items()
+        if words and words <= _words(end.rpartition(".")[2])
+    ]
+    if 0 < len(with_same_words) < 4:
+        return with_same_words
+    candidates = [end for end in ends if last == text or "." not in end]
+    return [
+        spelt[ends[known_name]] for known_name in difflib.get_close_matches(last, candidates, n=1)
+    ]
 
 
 def _words(name: str) -> set[str]:
@@ -283,7 +310,10 @@ def _words(name: str) -> set[str]:
 
 @functools.cache
 def field_docs(kind: type) -> Mapping[str, str]:
-    """The docstring below each field of a class, inherited ones included; none of a class without a source file."""
+    """Return the docstring below each field of a class and of its bases.
+
+    A class without a source file has none.
+    """
     docs: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         try:
@@ -298,11 +328,11 @@ def field_docs(kind: type) -> Mapping[str, str]:
     return docs
 
 
-def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:
-    """Build a dataclass, and those in its fields, from nested mappings; absent fields take their defaults."""
+def build(cls: type, mapping: object, label: str, prefix: str = "") -> Any:
+    """Build a dataclass, with nested ones, from nested mappings; missing fields take defaults."""
     if not isinstance(mapping, Mapping):
         raise ValueError(
-            f"{what} {prefix.rstrip('.')!r} = {mapping!r}: must be a mapping of {cls.__name__}'s"
+            f"{label} {prefix.rstrip('.')!r} = {mapping!r}: must be a mapping of {cls.__name__}'s"
             " fields"
         )
     nested = parts(cls)
@@ -317,44 +347,44 @@ def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:
         for field in dataclasses.fields(kind)
     ]
     check_names(
-        mapping, (field.name for field in dataclasses.fields(cls)), what, prefix, inner=inner
+        mapping, (field.name for field in dataclasses.fields(cls)), label, prefix, nested=inner
     )
 
-    def built(key: str, value: Any) -> Any:
-        """Return a part of a mapping as its dataclass; one that is a dataclass already stays."""
+    def convert(key: str, value: Any) -> Any:
+        """Return a nested mapping as its dataclass; a dataclass is returned unchanged."""
         if key not in nested or value is None or isinstance(value, nested[key]):
+            # The mapping changes only some values of the part, so the others come from its default.
             return value
-        if (
-            isinstance(value, Mapping) and key in absent
-        ):  # over what stands for the part where it is left out
+        if isinstance(value, Mapping) and key in absent:
             value = {**dataclasses.asdict(absent[key]), **value}
-        return build(nested[key], value, what, f"{prefix}{key}.")
+        return build(nested[key], value, label, f"{prefix}{key}.")
 
-    return cls(**{key: built(key, value) for key, value in mapping.items()})
+    return cls(**{key: convert(key, value) for key, value in mapping.items()})
 
 
 def part(absent: Any) -> Any:
-    """A field for an optional dataclass, None by default."""
+    """Return a field for an optional nested dataclass; None, the default, stands for `absent`."""
     return dataclasses.field(default=None, metadata={"absent": absent})
 
 
 def parts(cls: type) -> dict[str, type]:
-    """The fields of a dataclass that hold dataclasses, and which."""
-    found = {}
+    """Return the nested dataclasses of a dataclass by field."""
+    types_by_name = {}
     for field in dataclasses.fields(cls):
         if "absent" in field.metadata:
-            found[field.name] = type(field.metadata["absent"])
+            types_by_name[field.name] = type(field.metadata["absent"])
         elif dataclasses.is_dataclass(field.default):
-            found[field.name] = type(field.default)
-    return found
+            types_by_name[field.name] = type(field.default)
+    return types_by_name
 
 
 @functools.cache
 def declared_parts(cls: Any) -> dict[str, Any]:
-    """The `parts` of a dataclass that are declared as a class, or a union of some: as what."""
+    """Return the fields of `parts` that are declared as a class or union, with the declaration."""
+    # Names that only a type checker imports cannot be resolved at run time.
     try:
         hints = typing.get_type_hints(cls)
-    except NameError:  # names that only a type checker sees
+    except NameError:
         return {}
     declared = {name: hints[name] for name in parts(cls) if hints[name] is not Any}
     return {
@@ -364,7 +394,7 @@ def declared_parts(cls: Any) -> dict[str, Any]:
 
 def _bounded(
     default: Any,
-    holds: Callable[[Any], bool],
+    is_valid: Callable[[Any], bool],
     text: str,
     optional: bool = False,
     unit: str = "",
@@ -372,7 +402,7 @@ def _bounded(
     between: tuple[float | None, float | None] = (None, None),
 ) -> Any:
     metadata = {
-        "bound": (holds, text, optional or default is None, kind),
+        "bound": (is_valid, text, optional or default is None, kind),
         "unit": unit,
         "between": between,
     }

@@ -21,9 +21,9 @@ import numpy as np
 import codrl_mj
 from codrl_mj.actuators import NAMED, Drive
 from codrl_mj.catalogue import motor_entry, motor_names
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 from codrl_mj.sizing import design, find_drive, torque_limits
-from codrl_mj.study.bench import BLOCKED, on_bench
+from codrl_mj.study.bench import BLOCKED_INERTIA, make_bench
 from codrl_mj.tasks import PAPER_TASKS, named_actuator
 from codrl_mj.validation.motor_catalogue import NO_HEATING
 
@@ -58,7 +58,7 @@ def free_run(
         time_constant: rough estimate [s] of the time constant; the run lasts 20 times as long.
     """
     # 1e6 is far beyond every limit: the actuator drives the load as hard as it can.
-    speeds = on_bench(actuator, timestep, inertia)(1e6, 20.0 * time_constant)[:, 2]
+    speeds = make_bench(actuator, timestep, inertia)(1e6, 20.0 * time_constant)[:, 2]
     return float(speeds[-1]), float(timestep * (1.0 + np.sum(1.0 - speeds / speeds[-1])))
 
 
@@ -66,7 +66,7 @@ def task_row(task: str, name: str) -> dict[str, Any]:
     """Measure a named actuator on a task's bench: step to the largest force, stall, free run."""
     spec, actuator = TASKS[task], named_actuator(name, task)
     timestep, motor = spec.step_duration / spec.motor_inner_steps, actuator.motor
-    max_force, blocked = float(spec.max_forces[0]), on_bench(actuator, timestep, BLOCKED)
+    max_force, blocked = float(spec.max_forces[0]), make_bench(actuator, timestep, BLOCKED_INERTIA)
     torques = blocked(max_force, LONG)[:, 0]
     row: dict[str, Any] = {"task": task, "actuator": name}
     for band in (5, 2):
@@ -99,7 +99,7 @@ def _on_a_slide(task: str) -> bool:
 
 def motor_row(name: str) -> dict[str, Any]:
     """Measure a motor of the catalogue, cold, at its nominal voltage (or 24 V) and its own gear."""
-    drive, numbers = find_drive(name), motor_entry(name).numbers
+    drive, numbers = find_drive(name), motor_entry(name).parameters
     loop = design(drive)
     # Stall and no load are properties of the motor, so the controller does not limit the current.
     cold = dataclasses.replace(drive.motor, **NO_HEATING)
@@ -155,7 +155,7 @@ def _stall(drive: Drive, no_load_speed: float) -> float:
         / drive.arm_radius
     )
     # A motor that stands still may be held by friction, so it is turned slowly by a heavy load.
-    bench = on_bench(
+    bench = make_bench(
         drive, 1.0 / drive.controller.sample_rate, 1e4 * max_torque * duration / no_load_speed
     )
     slow, less_slow = (bench(1e6, duration, share * no_load_speed)[-1, 1] for share in (0.01, 0.02))
@@ -200,7 +200,7 @@ def _motor_line(row: dict[str, str]) -> list[str]:
     entry = motor_entry(row["motor"])
     measured = ("stall_torque", "no_load_speed", "continuous_torque")
     return [
-        f"`{row['motor']}`" + (" t" if entry.numbers.thermal_resistance else ""),
+        f"`{row['motor']}`" + (" t" if entry.parameters.thermal_resistance else ""),
         *(_number(row[name]) for name in ("voltage", "gear_ratio", *measured)),
     ]
 
@@ -257,7 +257,7 @@ def _write(measured: list[dict[str, Any]], path: Path) -> list[dict[str, str]]:
         }
         for row in measured
     ]
-    with writing(path) as temporary, temporary.open("w", newline="") as file:
+    with atomic_write(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(texts[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(texts)
@@ -274,7 +274,7 @@ def main() -> int:
     tables = {
         kind: _write(measured, options.out / TABLES[kind]) for kind, measured in rows().items()
     }
-    with writing(options.out / PAGE) as temporary:
+    with atomic_write(options.out / PAGE) as temporary:
         temporary.write_text(page(tables))
     print("\n".join(f"wrote {options.out / name}" for name in TABLES.values()))
     print(f"wrote {options.out / PAGE}")

@@ -31,7 +31,7 @@ import benchmark_subjects as subjects
 import codrl_mj
 from benchmark_subjects import Subject
 from codrl_mj.cli.terminal import console
-from codrl_mj.physics.sharing import cpus
+from codrl_mj.physics.sharing import num_cpus
 from codrl_mj.runs.files import read_json, write_json
 from codrl_mj.study import markdown_table, read_csv, write_csv, write_page
 from codrl_mj.tasks import PAPER_TASKS
@@ -200,7 +200,7 @@ def groups() -> dict[str, Makers]:
             partial(subjects.vector, "pendulum", count, 2),
         )
         groups_by_title[f"EnvPool: {count}"] = list(pair)
-    cores = sorted({1, 2, cpus()})
+    cores = sorted({1, 2, num_cpus()})
     sizes = [
         (num_envs, threads) for num_envs in (NUM_ENVS, 1, 64, 16_384, 100_000) for threads in cores
     ]

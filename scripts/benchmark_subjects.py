@@ -236,7 +236,7 @@ def raw_batch(task: str, num_envs: int, threads: int, calls_apart: bool) -> Subj
     batch, start, inner_steps = (
         Batch(physics.model, num_envs, threads),
         physics.snapshot(),
-        physics.plant.inner_steps,
+        physics.simulation.inner_steps,
     )
 
     def prepare() -> None:

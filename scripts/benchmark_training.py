@@ -470,7 +470,7 @@ def draw() -> None:
     """Draw the seconds until each contender has learned each task, as bars."""
     from matplotlib.figure import Figure
 
-    from codrl_mj.study.pages import save
+    from codrl_mj.study.pages import save_figure
 
     figure = Figure(figsize=(8.0, 4.2), layout="constrained")
     for axes, (task, enough) in zip(
@@ -487,7 +487,7 @@ def draw() -> None:
         axes.set(title=f"{TITLES[task]} to {enough:g}", xlabel="seconds of one core")
         axes.margins(x=0.15)
         axes.spines[["top", "right"]].set_visible(False)
-    save(figure, ROWS.with_suffix(".svg"))
+    save_figure(figure, ROWS.with_suffix(".svg"))
 
 
 def main() -> None:

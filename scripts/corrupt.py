@@ -37,7 +37,7 @@ from rich.table import Table
 
 from codrl_mj.cli import main as codrl_mj
 from codrl_mj.cli.terminal import console
-from codrl_mj.runs.files import leftovers, sealed
+from codrl_mj.runs.files import temporary_files, with_digest
 
 SOME = (1, 1, 1, 2, 3)
 """Number of changes in a case, drawn from these with equal probability."""
@@ -423,7 +423,7 @@ def corrupt_run(folder: Path, rng: random.Random) -> Case:
         content = change_entry(content, rng)
         # With a valid seal the file is accepted, so that the checks of its entries are reached.
         is_sealed = change != "entry" and isinstance(content, dict)
-        path.write_text(json.dumps(sealed(content) if is_sealed else content))
+        path.write_text(json.dumps(with_digest(content) if is_sealed else content))
     elif change == "exchanged" and exchanged.is_file():
         path.write_bytes(exchanged.read_bytes())
     else:
@@ -555,7 +555,7 @@ def attempt(case: Case, folder: Path, patience: float) -> Outcome:
     halves = [
         str(path.relative_to(folder))
         for parent in [folder, *folder.rglob("*")]
-        for path, _ in leftovers(parent)
+        for path, _ in temporary_files(parent)
     ]
     return Outcome(status, interrupted, output.read_text(errors="replace"), lost + halves)
 

@@ -16,7 +16,7 @@ from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.sources import find_source
 from codrl_mj.fields import field_docs
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 from codrl_mj.tasks import TASKS, named_actuator
 from page_pictures_tasks import SCENES
 
@@ -172,7 +172,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the pages")
     options = parser.parse_args()
     for name, text in pages().items():
-        with writing(options.out / name) as temporary:
+        with atomic_write(options.out / name) as temporary:
             temporary.write_text(text)
         print(f"wrote {options.out / name}")
     return 0

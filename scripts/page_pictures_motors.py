@@ -15,7 +15,7 @@ from PIL import Image
 
 from codrl_mj.actuators import Drive, GearMotor, Lag, SampledLoop, Supply, TorqueSpeed
 from codrl_mj.cli import main
-from codrl_mj.study.bench import BLOCKED, on_bench
+from codrl_mj.study.bench import BLOCKED_INERTIA, make_bench
 from codrl_mj.tasks import PAPER_TASKS, named_actuator
 from codrl_mj.viz.pages.plots import Curve, Plot, save_png
 
@@ -128,7 +128,7 @@ def actuators(out: Path) -> None:
     timestep, desired, inertia = 1e-3, 4.0, 0.2
     times = timestep * np.arange(1, 1501)
     curves = [
-        Curve(name, times, on_bench(actuator, timestep, inertia)(desired, times[-1])[:, 0])
+        Curve(name, times, make_bench(actuator, timestep, inertia)(desired, times[-1])[:, 0])
         for name, actuator in families.items()
     ]
     ideal = Curve("ideal", times, np.full_like(times, desired), reference=True, dashed=True)
@@ -150,7 +150,7 @@ def actuators_in_numbers(out: Path) -> None:
         timestep = task.step_duration / task.motor_inner_steps
         curves = []
         for name in ("paper", "weak", "weaker", "open_loop"):
-            torques = on_bench(named_actuator(name, task.name), timestep, BLOCKED)(
+            torques = make_bench(named_actuator(name, task.name), timestep, BLOCKED_INERTIA)(
                 float(task.max_forces[0]), 8.0
             )[:, 0]
             times = timestep * np.arange(len(torques) + 1)

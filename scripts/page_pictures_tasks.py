@@ -18,7 +18,7 @@ from PIL import Image
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, train
 from codrl_mj.viz.films.film import Panel, film
@@ -81,7 +81,7 @@ def make(task: str, path: Path) -> None:
         chosen = sorted({round(index) for index in np.linspace(0, len(images) - 1, FRAMES)})
         first, *later_images = (Image.open(images[index]).convert("RGB") for index in chosen)
         shown = [round(DURATION / len(chosen))] * len(later_images) + [LAST]
-        with writing(path) as temporary:
+        with atomic_write(path) as temporary:
             first.save(
                 temporary,
                 "webp",

@@ -19,7 +19,7 @@ from PIL import Image
 
 import codrl_mj
 from codrl_mj.cli import main as command
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 from codrl_mj.tasks import TASKS
 from codrl_mj.viz.films.strip import draw_text
 
@@ -66,7 +66,7 @@ def smaller(picture: Image.Image | Path, out: Path, width: int = 960) -> None:
     """Write a picture with a palette of 128 colors."""
     image = Image.open(picture) if isinstance(picture, Path) else picture
     size = width, round(image.height * width / image.width)
-    with writing(out) as temporary:
+    with atomic_write(out) as temporary:
         small = image.convert("RGB").resize(size, Image.Resampling.LANCZOS).quantize(128)
         small.save(temporary, "PNG", optimize=True)
 

@@ -23,7 +23,7 @@ from codrl_mj import cli
 from codrl_mj.actuators import Inputs
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import field_docs
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 from codrl_mj.tasks import TASKS, Task
 from codrl_mj.training import TrainConfig
 
@@ -295,7 +295,7 @@ def main() -> int:
     for name, text in pages().items():
         path = FOLDER / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        with writing(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text(f"{text}\n")
     print(f"wrote {FOLDER}")
     return 0

@@ -24,7 +24,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent, Normal
 
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 from codrl_mj.tasks import TASKS
 
 # These options must be at least 1, those of AMOUNTS at least 0.
@@ -349,7 +349,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Train, evaluate and save."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
     try:
-        with writing(options.out) as out, Progress() as bar:
+        with atomic_write(options.out) as out, Progress() as bar:
             row = bar.add_task(options.task, total=options.total_steps)
 
             def show(steps: int, mean_return: float) -> None:

@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "examples"))
 
 from codrl_mj.evaluation import evaluate  # noqa: E402
-from codrl_mj.runs.files import writing  # noqa: E402
+from codrl_mj.runs.files import atomic_write  # noqa: E402
 from codrl_mj.runs.policies import load_policy  # noqa: E402
 from codrl_mj.sizing import Candidate, actuators_of, choose, demands_of  # noqa: E402
 from codrl_mj.training import TrainConfig, train  # noqa: E402
@@ -80,7 +80,7 @@ def main() -> None:
     order = list(EXAMPLES)
     rows.sort(key=lambda row: order.index(row["environment"]))
     with (
-        writing(options.out / "worked_examples.csv") as temporary,
+        atomic_write(options.out / "worked_examples.csv") as temporary,
         temporary.open("w", newline="") as file,
     ):
         table = csv.DictWriter(file, COLUMNS)
@@ -145,7 +145,7 @@ def _example(name: str, options: Any) -> None:
             )
             rows.append(dict(zip(COLUMNS, values, strict=True)))
             print(*values, flush=True)
-    with writing(folder / "tests.json") as temporary:
+    with atomic_write(folder / "tests.json") as temporary:
         temporary.write_text(json.dumps(rows, indent=1))
 
 
@@ -161,13 +161,13 @@ def _motors(folder: Path, ideal: Path) -> dict[str, Any]:
             ranked = choose(demand)
             for name, choice in (("chosen", ranked[0]), ("smaller", _smaller(ranked))):
                 choices[name][motor] = choice, demand
-                verdict = choice.lacks or "does it"
+                verdict = choice.rejection_reason or "does it"
                 print(
                     f"{motor} {name}: {choice.name}, gear {choice.ratio:.4g}, {choice.power:.0f} W:"
                     f" {verdict}"
                 )
         for name, path in files.items():
-            with writing(path) as temporary:
+            with atomic_write(path) as temporary:
                 temporary.write_text(yaml.safe_dump(actuators_of(choices[name]), sort_keys=False))
     return {name: yaml.safe_load(path.read_text()) for name, path in files.items()}
 

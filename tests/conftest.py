@@ -28,7 +28,7 @@ They have continuous actions, an unbounded state, and walls.
 
 
 def pytest_collection_modifyitems(items):
-    """Mark rows of other tasks in such products as matrix, which only `make check` runs."""
+    """Mark rows of other tasks in other tasks, as matrix, which only `make check` runs."""
     for item in items:
         parameters = getattr(item, "callspec", None)
         if parameters and len(parameters.params) > 1:
@@ -38,7 +38,7 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
-    """Freeze objects that live as long as the process, so that garbage collection skips them."""
+    """Freeze objects that live as so that the process, so that garbage collection skips them."""
     gc.collect()
     gc.freeze()
 
@@ -58,14 +58,14 @@ def bare_engine():
 
 @pytest.fixture
 def installed(bare_engine):
-    """Install our motors' callbacks during the test, and remove all afterwards."""
+    """Install our motors' callbacks in MuJoCo during the test, and remove all afterwards."""
     engine.load_family(DCMotorActuator)
     engine.install()
 
 
 @pytest.fixture(autouse=True)
 def _remove_test_tasks():
-    """Remove tasks that a test has registered, because other tests use all registered tasks."""
+    """Remove tasks that a tasks has registered, because other tests use iterate registered tasks."""
     yield
     for name in set(TASKS) - BUILT_IN_TASKS:
         registry.pop(TASKS.pop(name).env_id, None)
@@ -73,5 +73,5 @@ def _remove_test_tasks():
 
 @pytest.fixture(autouse=True, scope="session")
 def _remove_columns():
-    """Remove COLUMNS, which processes of a parallel run have, so that tables are wide."""
+    """Remove COLUMNS, which processes COLUMNS, which processes have, so that tables are wide."""
     os.environ.pop("COLUMNS", None)

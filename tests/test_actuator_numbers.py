@@ -86,7 +86,7 @@ def test_cartpoles_loop_agrees_with_python_control():
 def test_a_motors_row_agrees_with_closed_forms():
     """The loop of the EC 45 flat is P/(z - 1)."""
     row = next(row for row in read_table("motors") if row["motor"] == "maxon-ec45-flat-50w")
-    numbers, rate, gain = motor_entry(row["motor"]).numbers, 20e3, -math.expm1(-0.349)
+    numbers, rate, gain = motor_entry(row["motor"]).parameters, 20e3, -math.expm1(-0.349)
     pole, constant, friction_current = 1 - gain, numbers.torque_constant, 0.238
     angle = math.acos((1 + pole**2 - 2 * gain**2) / (2 * pole))
     expected = {
@@ -110,7 +110,7 @@ def test_every_motor_of_the_catalogue_agrees_with_its_datasheet_in_the_engine(na
     """The datasheet's values hold to 5 %, values from its constants to 0.2 %."""
     entry, row = motor_entry(name), SCRIPT.motor_row(name)
     check_row(next(row for row in read_table("motors") if row["motor"] == name), row)
-    numbers, printed = entry.numbers, entry.datasheet.readings()
+    numbers, printed = entry.parameters, entry.datasheet.readings()
     ratio, torque_per_current = (
         numbers.gear_ratio,
         (numbers.gear_efficiency or 1.0) * numbers.torque_constant,

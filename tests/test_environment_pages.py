@@ -200,7 +200,7 @@ def test_the_number_of_integration_steps_is_that_of_the_environment(task):
     with_motor, without = map(int, re.findall(r"\d+", facts["integration steps in it"]))
     for actuator, count in (("default", with_motor), ("ideal", without)):
         env = ActuatedEnv(task, actuator)
-        assert env.physics.plant.inner_steps == count
+        assert env.physics.simulation.inner_steps == count
         assert env.model.opt.timestep == pytest.approx(
             float(facts["environment step"].split()[0]) / count
         )

@@ -1,4 +1,4 @@
-"""Episodes: they are those of single stepping, they repeat with their seeds, and files hold all of them."""
+"""Episodes: they equal single stepping, repeat with their seeds, and are saved completely."""
 
 import collections
 import io
@@ -22,7 +22,7 @@ ARRAYS = ("time", "state", "observation", "action", "reward")
 
 
 class Leaner:
-    """Pushes to the side on which it sees the last entry but one, a balancing pole's angle: it balances for a while."""
+    """Policy that pushes to the side given by the second last entry, a balancing pole's angle."""
 
     def __init__(self, space=TASKS["cartpole"].action_space):
         """Choose from the ends of the space."""
@@ -33,7 +33,7 @@ class Leaner:
 
     def predict(self, observation, *, deterministic=False):
         self.asked.append((len(observation), deterministic))
-        return np.array([self.ends[int(one[-2] > 0)] for one in observation]), None
+        return np.array([self.ends[int(lean[-2] > 0)] for lean in observation]), None
 
 
 def cartpole(actuator="weaker", **options):
@@ -41,15 +41,15 @@ def cartpole(actuator="weaker", **options):
 
 
 def assert_same(first, second):
-    """Two episodes are equal in every number."""
+    """Assert that two episodes are equal in every number."""
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
     for mapping in ("trace", "signals"):
-        one, other = getattr(first, mapping), getattr(second, mapping)
-        assert one.keys() == other.keys()
-        for name, values in one.items():
-            np.testing.assert_array_equal(values, other[name], err_msg=name)
-            assert values.dtype == other[name].dtype
+        first_values, second_values = getattr(first, mapping), getattr(second, mapping)
+        assert first_values.keys() == second_values.keys()
+        for name, values in first_values.items():
+            np.testing.assert_array_equal(values, second_values[name], err_msg=name)
+            assert values.dtype == second_values[name].dtype
     assert (first.terminated, first.actuator, first.command) == (
         second.terminated,
         second.actuator,
@@ -58,7 +58,7 @@ def assert_same(first, second):
 
 
 def stepped(env, seed, policy):
-    """The columns of an episode, and whether the task ended it, from single steps."""
+    """Return the columns of an episode from single steps, and whether the task ended it."""
     observation, _ = env.reset(seed=seed)
     columns = collections.defaultdict(
         list, {"observation": [observation], "state": [env.unwrapped.state]}
@@ -82,8 +82,8 @@ def stepped(env, seed, policy):
 
 @every_rebuilt
 @pytest.mark.parametrize("actuator", ["ideal", "paper"])
-def test_episodes_are_those_of_stepping_one_environment_at_a_time(task, actuator):
-    """Whatever their number and length: observations, states, rewards, signals, every integration step of the trace."""
+def test_episodes_equal_stepping_one_environment_at_a_time(task, actuator):
+    """Compare observations, states, rewards, signals and every integration step of the trace."""
     definition, family = TASKS[task], {"ideal": Ideal, "paper": DCMotorActuator}[actuator]
     count = max(3, definition.motor_inner_steps)
     make = EnvConfig(task, actuator, inner_steps=count, max_episode_steps=60).make
@@ -116,7 +116,7 @@ def test_episodes_are_those_of_stepping_one_environment_at_a_time(task, actuator
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
-def test_the_policy_is_asked_once_a_step_for_the_episodes_still_running_which_are_reported(
+def test_the_policy_is_called_once_per_step_for_all_running_episodes(
     deterministic,
 ):
     policy, reports = Leaner(), []
@@ -124,14 +124,14 @@ def test_the_policy_is_asked_once_a_step_for_the_episodes_still_running_which_ar
         policy, cartpole(), 3, 0, deterministic, on_step=lambda *counts: reports.append(counts)
     )
     lengths = [len(episode.reward) for episode in episodes]
-    assert len(set(lengths)) > 1  # they end at different times
+    assert len(set(lengths)) > 1  # The episodes end at different times.
     running = [sum(step < length for length in lengths) for step in range(max(lengths) + 1)]
     assert policy.asked == [(count, deterministic) for count in running[:-1]]
     assert reports == [(count, 3 - count) for count in running[1:]]
 
 
 class Sampler:
-    """Draws actions from torch's generator, as Stable-Baselines3's policies do, unless it is to be deterministic."""
+    """Policy that samples from torch's generator unless deterministic."""
 
     def predict(self, observation, *, deterministic=False):
         chosen = (
@@ -142,7 +142,7 @@ class Sampler:
         return chosen.numpy().astype(int), None
 
 
-def test_sampled_actions_repeat_with_their_seed_and_disturb_no_other():
+def test_sampled_actions_repeat_with_their_seed_and_leave_torch_s_generator_unchanged():
     run = lambda seed: run_episodes(Sampler(), cartpole(), 3, seed, deterministic=False)  # noqa: E731
     torch.manual_seed(11)
     expected = torch.rand(4)
@@ -153,13 +153,13 @@ def test_sampled_actions_repeat_with_their_seed_and_disturb_no_other():
         assert_same(episode, again)
     assert (
         len({episode.action[:8].tobytes() for episode in (*first, *run(8))}) == 6
-    )  # all of them differ
+    )  # All of them differ.
 
 
-# -- whatever the environment -------------------------------------------------------------------------------
+# -- with disturbances -----------------------------------------------------------------------------
 
 
-def test_episodes_know_what_was_drawn_for_them_and_what_was_commanded():
+def test_episodes_record_the_random_actuator_and_the_command():
     drawn = {"motor.resistance": Uniform(0.5, 2.0)}
     make = EnvConfig(
         "pendulum", "paper", randomize=drawn, action="current", max_episode_steps=3
@@ -176,7 +176,7 @@ def test_episodes_know_what_was_drawn_for_them_and_what_was_commanded():
     assert (ideal.actuator, ideal.command) == (IDEAL, "force")
 
 
-def test_analytic_physics_disturbed_runs_the_same_episodes():
+def test_analytic_physics_with_disturbances_gives_the_same_episodes():
     paper = named_actuator("paper", "cartpole").replaced(
         {"controller.current_bias": 0.1, "supply": Supply(resistance=0.5)}
     )
@@ -185,24 +185,26 @@ def test_analytic_physics_disturbed_runs_the_same_episodes():
         run_episodes(Leaner(), cartpole(paper, physics=physics, **options), 3)
         for physics in ("mujoco", "analytic")
     )
-    for one, other in zip(ours, theirs, strict=True):
-        for name, values in one.trace.items():
-            np.testing.assert_allclose(values, other.trace[name], rtol=0, atol=1e-9, err_msg=name)
-        np.testing.assert_allclose(one.state, other.state, rtol=0, atol=1e-9)
+    for mujoco_episode, analytic_episode in zip(ours, theirs, strict=True):
+        for name, values in mujoco_episode.trace.items():
+            np.testing.assert_allclose(
+                values, analytic_episode.trace[name], rtol=0, atol=1e-9, err_msg=name
+            )
+        np.testing.assert_allclose(mujoco_episode.state, analytic_episode.state, rtol=0, atol=1e-9)
 
 
-# -- random policy ------------------------------------------------------------------------------------------
+# -- random policy ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", list(TASKS))
-def test_the_random_policy_draws_from_the_whole_action_space_and_repeats_with_its_seed(task):
+def test_the_random_policy_samples_the_whole_action_space_and_repeats_with_its_seed(task):
     space = TASKS[task].action_space
     draw = lambda seed: RandomPolicy(task, seed).predict(np.zeros((300, 4)))[0]  # noqa: E731
     space.seed(4)
     expected = space.sample()
     space.seed(4)
     actions = draw(0)
-    np.testing.assert_array_equal(space.sample(), expected)  # the task's own space is left alone
+    np.testing.assert_array_equal(space.sample(), expected)  # The task's space is not changed.
     assert actions.shape == (300, *space.shape)
     assert all(space.contains(action) for action in actions)
     np.testing.assert_array_equal(actions, draw(0))
@@ -223,12 +225,12 @@ def test_the_random_policy_draws_from_the_whole_action_space_and_repeats_with_it
         (lambda: RandomPolicy("cartpol"), "did you mean 'cartpole'"),
     ],
 )
-def test_bad_counts_seeds_and_tasks_are_named(call, words):
+def test_raises_if_the_count_seed_or_task_is_invalid(call, words):
     with pytest.raises(ValueError, match=words):
         call()
 
 
-# -- trajectories -------------------------------------------------------------------------------------------
+# -- trajectories ----------------------------------------------------------------------------------
 
 
 SPECIAL = {"motor": {"arm_radius": 0.1}, "controller": {"max_voltage": float("inf")}}
@@ -242,7 +244,7 @@ def swing(actuator="ideal"):
 
 
 @pytest.mark.parametrize("actuator", ["weaker", "ideal", SPECIAL], ids=str)
-def test_a_saved_episode_is_read_back_exactly(tmp_path, actuator):
+def test_a_saved_episode_is_loaded_exactly(tmp_path, actuator):
     episode, path = swing(actuator), tmp_path / "new" / "swing.npz"
     save_episode(episode, path)
     again = load_episode(path)
@@ -252,7 +254,7 @@ def test_a_saved_episode_is_read_back_exactly(tmp_path, actuator):
     assert again.terminated is episode.terminated is False
 
 
-def test_a_trajectory_of_another_suffix_is_refused_and_a_missing_one_named(tmp_path):
+def test_raises_if_the_suffix_is_wrong_or_the_file_is_missing(tmp_path):
     with pytest.raises(ValueError, match=r"swing\.csv: the suffix must be \.npz"):
         save_episode(swing(), tmp_path / "swing.csv")
     assert list(tmp_path.iterdir()) == []
@@ -260,9 +262,9 @@ def test_a_trajectory_of_another_suffix_is_refused_and_a_missing_one_named(tmp_p
         load_episode(tmp_path / "swing.npz")
 
 
-def without_most(_):
-    np.savez(other := io.BytesIO(), time=np.zeros(3))
-    return other.getvalue()
+def without_an_array(_):
+    np.savez(kept_name := io.BytesIO(), time=np.zeros(3))
+    return kept_name.getvalue()
 
 
 def flipped(whole):
@@ -273,13 +275,13 @@ def flipped(whole):
 @pytest.mark.parametrize(
     "change",
     [
-        without_most,
+        without_an_array,
         flipped,
         lambda whole: whole[: len(whole) // 2],
         lambda _: pickle.dumps({"time": 1}),
     ],
 )
-def test_what_is_no_trajectory_is_refused(tmp_path, change):
+def test_raises_if_the_file_is_not_a_trajectory(tmp_path, change):
     path = tmp_path / "swing.npz"
     save_episode(swing("weaker"), path)
     path.write_bytes(change(path.read_bytes()))

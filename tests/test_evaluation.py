@@ -1,4 +1,4 @@
-"""Evaluation: every measure against counting, a closed form, an identity of the equations, or a direct calculation."""
+"""Evaluation: measures against counting, a closed form, an identity or a direct calculation."""
 
 import dataclasses
 import functools
@@ -39,14 +39,14 @@ ELECTRICAL = PEAKS | {"energy_drawn", "energy_returned", "copper_loss", "magneti
 
 
 class Leaner:
-    """Pushes the cart to the side to which the pole leans, which balances it for a while; else to the other one."""
+    """Policy that pushes the cart to the side to which the pole leans, or to the opposite side."""
 
     def predict(self, observation, *, deterministic=False):
         return np.where((observation[:, 2] > 0) == deterministic, 1, 0), None
 
 
 class Constant:
-    """Always the same action of a box of one number; or, step by step, the one way and the other."""
+    """Policy with a constant action, or one that alternates its sign, for a box of one number."""
 
     def __init__(self, action, factor=1.0):
         """Keep the action, which changes by the factor from one step to the next."""
@@ -60,7 +60,7 @@ class Constant:
 MOTOR = DCMotorActuator()
 
 
-def made_up(
+def minimal_episode(
     task="cartpole",
     actuator=MOTOR,
     states=None,
@@ -69,10 +69,10 @@ def made_up(
     terminated=True,
     desired=None,
 ):
-    """An episode from the little that a measure reads, of which `rows` are the trace's, with the entries of `ROW`.
+    """Return an episode with only the fields that a measure reads.
 
-    There is a step for each row unless states say otherwise; desired in a step is by default what
-    its end delivers.
+    `rows` are the rows of the trace, with the entries of `ROW`. There is one step per row unless
+    `states` has another number. The desired torque of a step is by default the torque at its end.
     """
     definition = TASKS[task]
     steps = len(rows) if states is None else len(states) - 1
@@ -89,7 +89,7 @@ def made_up(
         for name, values in trace.items()
         if name != "speed"
     }
-    asked = ends["actual_force"] if desired is None else np.array(desired, dtype=float)
+    desired = ends["actual_force"] if desired is None else np.array(desired, dtype=float)
     return Episode(
         time=definition.step_duration * np.arange(1, steps + 1),
         state=states,
@@ -98,18 +98,18 @@ def made_up(
         reward=np.ones(steps) if reward is None else np.array(reward),
         first_speeds=states[0, list(definition.speed_indices)],
         trace=trace,
-        signals=ends | {"desired_force": asked},
+        signals=ends | {"desired_force": desired},
         terminated=terminated,
         actuator=actuator,
     )
 
 
-# -- returns, success, time to goal -------------------------------------------------------------------------
+# -- returns, success, time to goal ----------------------------------------------------------------
 
 
-def test_returns_and_lengths_are_counted():
+def test_returns_and_lengths_are_correct():
     episodes = [
-        made_up(rows=[(0, 0, 0, 0, 0)] * len(rewards), reward=rewards, terminated=over)
+        minimal_episode(rows=[(0, 0, 0, 0, 0)] * len(rewards), reward=rewards, terminated=over)
         for rewards, over in (
             ([1.0, 2.0], True),
             ([0.0], False),
@@ -136,7 +136,7 @@ ROLLING, SHORT = [0, 0.01], [[0, 0.01]] * 3
 
 
 def arriving(goal):
-    """Of a car after 7 s, after 9 s, over the flag and back, and not at all."""
+    """Return cars that arrive after 7 s, after 9 s, pass the flag and return, or never arrive."""
     beyond = goal + 0.01
     late = ([ROLLING] * 9 + [[goal, 0.0]], True)
     return [
@@ -150,29 +150,29 @@ def arriving(goal):
 @pytest.mark.parametrize(
     ("task", "episodes", "share", "quartiles"),
     [
-        # a pole that stands at the time limit
+        # A pole that stands until the time limit.
         (
             "cartpole",
             [(STANDING, False), (FALLEN, True), (FALLEN, True), (STANDING, False)],
             0.5,
             None,
         ),
-        # a car at its flag, an acrobot at its height, and when
+        # A car at its flag and an acrobot at its height, with the time.
         ("mountain_car", arriving(0.5), 0.5, (8.0, 7.5, 8.5)),
         ("mountain_car_continuous", arriving(0.45), 0.5, (8.0, 7.5, 8.5)),
         ("acrobot", [([DOWN, DOWN, UP], True), ([DOWN] * 4, False)], 0.5, (0.4, 0.4, 0.4)),
-        # a pendulum upright and still for its last second, settled at the last time that it was not
+        # A pendulum upright and still for its last second; the time is when it settled.
         ("pendulum", [([HANGING] * 30 + [UPRIGHT] * 21, False)], 1.0, [30 * 0.05] * 3),
         ("pendulum", [([UPRIGHT] * 40 + [HANGING] + [UPRIGHT] * 30, False)], 1.0, [41 * 0.05] * 3),
         ("pendulum", [([HANGING] * 30 + [UPRIGHT] * 20, False)], 0.0, None),  # 0.95 s
         ("pendulum", [([UPRIGHT] * 60 + [FAST], False)], 0.0, None),
         ("pendulum", [([UPRIGHT] * 40 + [SWUNG] + [UPRIGHT] * 5, False)], 0.0, None),
-        ("pendulum", [([UPRIGHT] * 15, False)], 0.0, None),  # shorter than a second
+        ("pendulum", [([UPRIGHT] * 15, False)], 0.0, None),  # Shorter than a second.
     ],
 )
-def test_an_episode_succeeds_as_its_task_says_from_when_it_does(task, episodes, share, quartiles):
+def test_success_and_time_to_goal_follow_the_task_s_definition(task, episodes, share, quartiles):
     summary = summarize(
-        task, [made_up(task, IDEAL, states, terminated=over) for states, over in episodes]
+        task, [minimal_episode(task, IDEAL, states, terminated=over) for states, over in episodes]
     )
     assert summary.success.mean == share
     assert summary.failure == pytest.approx(
@@ -183,30 +183,32 @@ def test_an_episode_succeeds_as_its_task_says_from_when_it_does(task, episodes, 
     assert summary.time_to_goal == (quartiles if quartiles is None else pytest.approx(quartiles))
 
 
-# -- tracking -----------------------------------------------------------------------------------------------
+# -- tracking --------------------------------------------------------------------------------------
 
 
 def pushing(*forces):
     return [(force, 0, 0, 0, 0) for force in forces]
 
 
-def test_the_tracking_error_is_that_of_every_integration_step_in_torques_at_the_shaft():
+def test_the_tracking_error_uses_every_integration_step_at_the_shaft():
     arm = 0.25
     actuator = DCMotorActuator(Motor(arm_radius=arm))
-    # two environment steps of two integration steps each: 10 N, then -10 N are desired throughout;
-    # and one more
-    first = made_up(
+    # Two environment steps of two integration steps each, with a desired force of 10 N and then
+    # -10 N; and one more step.
+    first = minimal_episode(
         "cartpole",
         actuator,
         np.zeros((3, 4)),
         pushing(8.0, 10.0, -4.0, -10.0),
         desired=[10.0, -10.0],
     )
-    second = made_up("cartpole", actuator, np.zeros((2, 4)), pushing(9.0, 10.0), desired=[10.0])
+    second = minimal_episode(
+        "cartpole", actuator, np.zeros((2, 4)), pushing(9.0, 10.0), desired=[10.0]
+    )
     summary = summarize("cartpole", [first, second])
     error = (
         math.sqrt((2.0**2 + 6.0**2 + 1.0**2) / 6) * arm
-    )  # N*m; the steps' ends are without error
+    )  # N*m; the errors at the ends of the steps are 0.
     assert summary.tracking_rms == pytest.approx(error, rel=1e-12)
     assert summary.tracking_percent == pytest.approx(100 * error / (10.0 * arm), rel=1e-12)
     assert summary.tracking_max == pytest.approx(6.0 * arm, rel=1e-12)
@@ -215,19 +217,21 @@ def test_the_tracking_error_is_that_of_every_integration_step_in_torques_at_the_
         math.sqrt(sum(f**2 for f in delivered) / 6) * arm, rel=1e-12
     )
     duration = float(first.time[-1] + second.time[-1])
-    assert summary.reversals == pytest.approx(1 / duration, rel=1e-12)  # none between episodes
+    assert summary.reversals == pytest.approx(
+        1 / duration, rel=1e-12
+    )  # No sign change counts between episodes.
 
 
-def test_tracking_is_weighed_over_all_steps_and_not_per_episode():
-    nine_bad = made_up(rows=pushing(*[0] * 9), desired=[1.0] * 9)
-    one_good = made_up(rows=[(1.0, 0, 0, 0, 1)], desired=[1.0])
+def test_tracking_is_averaged_over_steps_not_episodes():
+    nine_bad = minimal_episode(rows=pushing(*[0] * 9), desired=[1.0] * 9)
+    one_good = minimal_episode(rows=[(1.0, 0, 0, 0, 1)], desired=[1.0])
     summary = summarize("cartpole", [nine_bad, one_good])
     assert summary.tracking_rms == pytest.approx(math.sqrt(0.9), rel=1e-12)
     assert summary.saturated_percent == pytest.approx(10.0, rel=1e-12)
 
 
 def test_a_desired_torque_of_zero_has_no_relative_error_and_no_delay():
-    summary = summarize("cartpole", [made_up(rows=pushing(*[0.5] * 4), desired=[0.0] * 4)])
+    summary = summarize("cartpole", [minimal_episode(rows=pushing(*[0.5] * 4), desired=[0.0] * 4)])
     assert (summary.tracking_rms, summary.tracking_percent, summary.tracking_lag) == (
         0.5,
         None,
@@ -236,12 +240,12 @@ def test_a_desired_torque_of_zero_has_no_relative_error_and_no_delay():
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.15])
-def test_the_lag_of_an_ideal_actuator_is_the_delay_of_its_commands(delay):
+def test_the_lag_of_an_ideal_actuator_is_its_command_delay(delay):
     env = EnvConfig("pendulum", "ideal", disturbances=Disturbances(command_delay=delay))
     result = evaluate(RandomPolicy("pendulum"), env, episodes=5)
     assert result.tracking_lag == pytest.approx(
         delay, abs=0.001
-    )  # noise beside the peak: 1/sqrt(1000) steps of 0.05 s
+    )  # The noise beside the peak is 1/sqrt(1000) steps of 0.05 s.
     assert (result.tracking_rms > 0) == (delay > 0)
 
 
@@ -252,7 +256,7 @@ def test_the_ideal_actuator_tracks_perfectly_and_has_no_motor():
     assert result.mechanical_work.mean > 0
 
 
-def test_a_voltage_that_the_agent_commands_asks_for_no_torque():
+def test_a_voltage_command_has_no_tracking_measures():
     env = EnvConfig("pendulum", action="voltage", max_episode_steps=5)
     result = evaluate(Constant(1.0), env, episodes=2)
     assert (
@@ -265,8 +269,8 @@ def test_a_voltage_that_the_agent_commands_asks_for_no_torque():
     assert result.peak_voltage == 1.0
 
 
-class Seen(NamedTuple):
-    """What `Position` shows: volts, without a unit in `SIGNAL_UNITS`."""
+class VoltSignals(NamedTuple):
+    """Signals of `Position`: volts, without a unit in `SIGNAL_UNITS`."""
 
     current: float
     voltage: float
@@ -275,31 +279,31 @@ class Seen(NamedTuple):
 def advance(parameters, timestep, state, inputs):
     voltage = min(max(parameters.gain * (inputs.desired_torque - inputs.position), -12.0), 12.0)
     current = (voltage - inputs.speed) / 4.0
-    return state, 0.01 * current, Seen(current, voltage)
+    return state, 0.01 * current, VoltSignals(current, voltage)
 
 
 @dataclasses.dataclass(frozen=True)
 class Position(ActuatorModel):
-    """A hobby servo: asked for an angle, it puts a voltage on its winding."""
+    """Hobby servo whose command is an angle, and which applies a voltage to its winding."""
 
-    Signals: ClassVar[type] = Seen
+    Signals: ClassVar[type] = VoltSignals
     advance: ClassVar = staticmethod(advance)
     MOTION: ClassVar[bool] = True
-    tracks: ClassVar[bool] = False
+    is_torque_controlled: ClassVar[bool] = False
     gain: float = real(5.0, above=0.0)
 
 
-def test_an_angle_that_is_asked_for_is_no_torque_that_could_be_missed():
+def test_an_angle_command_has_no_tracking_measures():
     env = EnvConfig(
         "Reacher-v5", {"joint0": Position(), "joint1": Lag(time_constant=0.1)}, max_episode_steps=4
     )
     (episode,) = run_episodes(RandomPolicy(env.action_space, 0), env.make, 1, 3)
-    assert episode.tracks == (False, True)
+    assert episode.is_torque_controlled == (False, True)
     result = summarize(env.task, [episode])
     assert result.motors["joint0"]["tracking_rms"] is None
-    # overall it is the error of the one motor that was asked for a torque
-    asked = np.repeat(episode.signals["desired_force"][:, 1], episode.inner_steps)
-    error = asked - episode.trace["actual_force"][:, 1]
+    # The total is the error of the only motor with a torque command.
+    command = np.repeat(episode.signals["desired_force"][:, 1], episode.inner_steps)
+    error = command - episode.trace["actual_force"][:, 1]
     assert result.tracking_rms == pytest.approx(math.sqrt(np.mean(error**2)), rel=1e-12)
     assert result.motors["joint1"]["tracking_rms"] == result.tracking_rms
     shown = [RunEpisode("run", env, episode, None, None, 3)]
@@ -311,9 +315,9 @@ def test_an_angle_that_is_asked_for_is_no_torque_that_could_be_missed():
         assert [curve.label for curve in plots[title].curves if name in curve.label] == [
             f"joint1: {name}"
         ]
-    alone = EnvConfig("Reacher-v5", Position(), max_episode_steps=4)
-    (episode,) = run_episodes(RandomPolicy(alone.action_space, 0), alone.make, 1, 3)
-    result = summarize(alone.task, [episode])
+    current_only = EnvConfig("Reacher-v5", Position(), max_episode_steps=4)
+    (episode,) = run_episodes(RandomPolicy(current_only.action_space, 0), current_only.make, 1, 3)
+    result = summarize(current_only.task, [episode])
     assert (
         result.tracking_rms
         is result.tracking_percent
@@ -322,12 +326,14 @@ def test_an_angle_that_is_asked_for_is_no_torque_that_could_be_missed():
         is None
     )
     plots = _motor_plots(
-        _motor_series([RunEpisode("run", alone, episode, None, None, 3)], list(episode.motors))
+        _motor_series(
+            [RunEpisode("run", current_only, episode, None, None, 3)], list(episode.motors)
+        )
     )
     assert "Error: desired less actual" not in [plot.title for plot in plots]
 
 
-def test_a_film_shows_the_voltage_of_every_family_that_has_one(monkeypatch):
+def test_a_film_shows_the_voltage_of_every_family_with_one(monkeypatch):
     assert strip._signal(Position()) == ("voltage", "u [V]")
     assert strip._signal(IDEAL) == (None, "u [V]")
     assert strip._signal(Lag()) == (None, "")
@@ -341,11 +347,11 @@ def test_a_film_shows_the_voltage_of_every_family_that_has_one(monkeypatch):
     assert [text.get_text() for text in drawn[0].legends[0].get_texts()] == ["actual", "voltage"]
 
 
-# -- the motor ----------------------------------------------------------------------------------------------
+# -- the motor -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("max_voltage", [0.3, 0.6, 1.0, 24.0])
-def test_the_saturated_share_is_that_of_voltages_at_the_limit(max_voltage):
+def test_the_saturated_share_counts_voltages_at_the_limit(max_voltage):
     weaker = named_actuator("weaker", "cartpole")
     actuator = DCMotorActuator(
         weaker.motor, CurrentLoop(kp=0.2, ki=0.2, kff=0.5, max_voltage=max_voltage)
@@ -361,8 +367,8 @@ def test_the_saturated_share_is_that_of_voltages_at_the_limit(max_voltage):
     assert (summary.saturated_percent > 0) == (max_voltage <= 1.0)
 
 
-def test_a_stalled_motor_is_measured_as_its_closed_form_says():
-    """No back-EMF, a constant voltage: i(k) = u/R*(1 - q^k) with q = 1 - R*dt/L; every sum below is geometric."""
+def test_a_stalled_motor_agrees_with_its_closed_form():
+    """At constant voltage i(k) = u/R*(1 - q^k) with q = 1 - R*dt/L, so sums are geometric."""
     motor, voltage, steps, count = (
         Motor(resistance=2.0, inductance=1.5, back_emf_constant=0.0),
         0.5,
@@ -395,7 +401,7 @@ def test_a_stalled_motor_is_measured_as_its_closed_form_says():
         math.sqrt(heat / motor.resistance / (n * dt)), rel=1e-12
     )
     assert (result.peak_voltage, result.saturated_percent) == (voltage, 0.0)
-    # and the motor itself, not its Euler steps: they err by dt/T = 1/15 of the transient
+    # The exact motor: Euler's steps differ by dt/T = 1/15 of the transient.
     time, constant = n * dt, motor.electrical_time_constant
     transient = voltage * final * constant
     exact = voltage * final * (time - constant * (1 - math.exp(-time / constant)))
@@ -403,8 +409,8 @@ def test_a_stalled_motor_is_measured_as_its_closed_form_says():
 
 
 @pytest.mark.parametrize("task", ["pendulum", "acrobot", "mountain_car"])
-def test_the_whole_energy_balance_closes_as_the_steps_shorten(task):
-    """With kE = kT all that is drawn and not returned is heat, field or work, but for Euler's error of first order."""
+def test_the_energy_balance_converges_with_the_step(task):
+    """With kE = kT, drawn minus returned energy is heat, field or work, up to Euler's error."""
     gaps, actuator = [], DCMotorActuator(Motor(), CurrentLoop(kp=2.0, ki=2.0))
     for timestep in (0.005, 0.0025, 0.00125):  # the winding's time constant is 0.1 s
         env = EnvConfig(task, actuator, timestep=timestep, max_episode_steps=8)
@@ -417,8 +423,8 @@ def test_the_whole_energy_balance_closes_as_the_steps_shorten(task):
     assert coarse < 0.1 * spent
 
 
-def test_a_drive_draws_what_becomes_heat_and_work_though_its_winding_is_far_faster_than_a_step():
-    """2.5 ms beside 0.14 ms: mean volts times currents of steps would make more heat than is drawn."""
+def test_a_drive_s_energy_balance_holds_if_its_winding_is_much_faster_than_a_step():
+    """The step is 2.5 ms and L/R 0.14 ms, so mean voltage times mean current is too much."""
     motor = GearMotor(8.4, 1.16e-3, 0.042, 0.042, rotor_inertia=4e-6, gear_ratio=40.0)
     drive = Drive(motor, SampledLoop(20e3, max_current=0.8), Supply(18.0))
     env = EnvConfig("pendulum", drive, timestep=0.0025, max_episode_steps=100)
@@ -431,22 +437,22 @@ def test_a_drive_draws_what_becomes_heat_and_work_though_its_winding_is_far_fast
         math.sqrt(result.copper_loss.mean / 8.4 / duration), rel=1e-12
     )
     assert result.saturated_percent == result.current_saturated_percent == 100.0
-    assert 0.0 < result.voltage_saturated_percent < 50.0  # while the current turns round
+    assert 0.0 < result.voltage_saturated_percent < 50.0  # While the current reverses.
     assert result.temperature_saturated_percent == 0.0
 
 
-def test_work_energies_and_peaks_are_those_of_the_shaft():
+def test_work_energies_and_peaks_refer_to_the_shaft():
     motor = Motor(arm_radius=0.5, resistance=2.0)
-    # force, current, voltage, speed, saturated; then it brakes
+    # Force, current, voltage, speed, saturated. Then the motor brakes.
     rows = [
         (3.0, 1.0, 6.0, 0.5, 0),
         (1.0, -4.0, -7.0, -0.8, 1),
         (0.0, -4.0, 3.0, -0.8, 1),
         (0.0, 0.0, 0.0, -0.8, 0),
     ]
-    states = [[0.0, -0.9, 0.0, 0.0]] * 5  # before the first step the cart moves at -0.9 m/s
+    states = [[0.0, -0.9, 0.0, 0.0]] * 5  # Before the first step the cart moves at -0.9 m/s.
     result = summarize(
-        "cartpole", [made_up(actuator=DCMotorActuator(motor), states=states, rows=rows)] * 2
+        "cartpole", [minimal_episode(actuator=DCMotorActuator(motor), states=states, rows=rows)] * 2
     )
     dt = 0.02
     assert result.mechanical_work.mean == pytest.approx((3.0 * -0.2 + 1.0 * -0.15) * dt, rel=1e-12)
@@ -458,14 +464,14 @@ def test_work_energies_and_peaks_are_those_of_the_shaft():
     assert result.peak_speed == pytest.approx(0.9 / 0.5)
 
 
-def test_every_episode_is_measured_with_the_motor_that_was_drawn_for_it():
+def test_every_episode_is_measured_with_its_random_motor():
     drawn = {"motor.resistance": Uniform(0.5, 3.0), "motor.arm_radius": Uniform(0.5, 2.0)}
     env = EnvConfig("pendulum", "weak", max_episode_steps=20, randomize=drawn)
     result = evaluate(RandomPolicy("pendulum"), env, episodes=3)
     episodes = run_episodes(RandomPolicy("pendulum"), env.make, 3)
     arms = [episode.actuator.motor.arm_radius for episode in episodes]
     assert len(set(arms)) == 3
-    alone = [summarize("pendulum", [episode]) for episode in episodes]
+    single = [summarize("pendulum", [episode]) for episode in episodes]
     errors = [
         np.repeat(e.signals["desired_force"], e.inner_steps) - e.trace["actual_force"]
         for e in episodes
@@ -474,18 +480,18 @@ def test_every_episode_is_measured_with_the_motor_that_was_drawn_for_it():
     fastest = [max(abs(e.state[0, 1]), np.abs(e.trace["speed"]).max()) for e in episodes]
     assert result.peak_speed == pytest.approx(max(np.array(fastest) / arms), rel=1e-12)
     powers = [
-        e.actuator.motor.resistance * one.rms_current**2
-        for e, one in zip(episodes, alone, strict=True)
+        e.actuator.motor.resistance * episode.rms_current**2
+        for e, episode in zip(episodes, single, strict=True)
     ]
     assert result.copper_loss.mean == pytest.approx(
         np.mean(powers) * episodes[0].time[-1], rel=1e-12
     )
 
 
-# -- the whole ----------------------------------------------------------------------------------------------
+# -- the whole -------------------------------------------------------------------------------------
 
 
-def test_an_evaluation_is_the_summary_of_its_episodes_and_says_what_it_was_measured_under():
+def test_an_evaluation_summarizes_its_episodes_and_records_its_conditions():
     actuator = named_actuator("weaker", "cartpole").replaced({"controller.current_bias": 0.2})
     late = {"command_delay": 0.01}
     env = EnvConfig("cartpole", actuator, "analytic", inner_steps=2, disturbances=late)

@@ -1,4 +1,4 @@
-"""Fields that know their bounds: what they take, what they refuse, and that a refusal names field, value and bound."""
+"""Validated fields: accepted values, and errors with field, value and bound."""
 
 import dataclasses
 import math
@@ -15,28 +15,28 @@ from codrl_mj.fields import (
     check_names,
     choice,
     did_you_mean,
-    factors,
     flag,
     integer,
     part,
     parts,
+    positive_integers,
+    positive_reals,
     real,
     reals,
-    units,
 )
 
 BOUNDS = {
     "above": (lambda value, limit: value > limit, ">"),
-    "least": (lambda value, limit: value >= limit, ">="),
+    "minimum": (lambda value, limit: value >= limit, ">="),
     "below": (lambda value, limit: value < limit, "<"),
-    "most": (lambda value, limit: value <= limit, "<="),
+    "maximum": (lambda value, limit: value <= limit, "<="),
 }
 WORDS = st.text("a1.e- é", max_size=3)
 NOT_REAL = st.sampled_from([True, False, np.True_, "1", None, [1.0], (1.0,), 1j, {}]) | WORDS
 
 
 def _settings(field):
-    """A class of one field, checked when it is made."""
+    """Return a validated class with one field."""
     return dataclasses.make_dataclass(
         "Settings", [("field", object, field)], frozen=True, bases=(Checked,)
     )
@@ -52,7 +52,7 @@ def _refusal(kind, value):
 
 @pytest.mark.parametrize("bound", BOUNDS)
 @given(value=st.floats(), limit=st.integers(-99, 99))
-def test_a_number_is_taken_exactly_within_its_bound(bound, value, limit):
+def test_a_number_is_accepted_exactly_within_its_bound(bound, value, limit):
     holds, sign = BOUNDS[bound]
     kind = _settings(real(limit, **{bound: limit}))
     if math.isfinite(value) and holds(value, limit):
@@ -62,8 +62,8 @@ def test_a_number_is_taken_exactly_within_its_bound(bound, value, limit):
 
 
 @given(value=st.floats() | st.integers(-5, 5).map(float))
-def test_two_bounds_hold_together(value):
-    kind = _settings(real(0.0, above=-2, most=3))
+def test_two_bounds_apply_together(value):
+    kind = _settings(real(0.0, above=-2, maximum=3))
     if -2 < value <= 3:
         assert kind(field=value).field == value
     else:
@@ -71,7 +71,7 @@ def test_two_bounds_hold_together(value):
 
 
 @given(value=st.floats())
-def test_where_infinity_is_taken_only_the_bound_counts(value):
+def test_infinity_is_accepted_if_allowed(value):
     kind = _settings(real(1.0, above=0.0, infinite=True))
     if value > 0.0:
         assert kind(field=value).field == value
@@ -79,38 +79,38 @@ def test_where_infinity_is_taken_only_the_bound_counts(value):
         assert _refusal(kind, value) == "a number > 0"
 
 
-@given(value=st.integers(-50, 50), least=st.integers(-9, 9))
-def test_an_integer_is_taken_exactly_within_its_bound(value, least):
-    kind = _settings(integer(least, least=least))
+@given(value=st.integers(-50, 50), minimum=st.integers(-9, 9))
+def test_an_integer_is_accepted_exactly_within_its_bound(value, minimum):
+    kind = _settings(integer(minimum, minimum=minimum))
     for of_kind in (int, np.int32, np.int64):
-        if value >= least:
+        if value >= minimum:
             stored = kind(field=of_kind(value)).field
             assert type(stored) is int
             assert stored == value
         else:
-            assert _refusal(kind, of_kind(value)) == f"an integer >= {least}"
+            assert _refusal(kind, of_kind(value)) == f"an integer >= {minimum}"
 
 
 @given(value=st.floats() | NOT_REAL)
-def test_nothing_but_an_integer_is_one(value):
+def test_raises_if_a_value_is_not_an_integer(value):
     assume(value is not None)
-    assert _refusal(_settings(integer(1, least=1)), value) == "an integer >= 1"
+    assert _refusal(_settings(integer(1, minimum=1)), value) == "an integer >= 1"
 
 
 @given(value=NOT_REAL)
-def test_nothing_but_a_number_is_one(value):
+def test_raises_if_a_value_is_not_a_number(value):
     assert _refusal(_settings(real(1.0)), value) == "a finite number"
 
 
 @pytest.mark.parametrize("of_kind", [int, float, np.float32, np.float64, np.int16])
-def test_numbers_of_every_kind_are_stored_as_pythons_own(of_kind):
+def test_all_types_of_numbers_are_stored_as_python_numbers(of_kind):
     stored = _settings(real(1.0))(field=of_kind(2)).field
     assert type(stored) is float
     assert stored == 2.0
 
 
-@pytest.mark.parametrize("field", [real(None), real(1.0, optional=True), integer(None, least=1)])
-def test_none_is_taken_where_it_may_be_and_said_where_it_is_not_given(field):
+@pytest.mark.parametrize("field", [real(None), real(1.0, optional=True), integer(None, minimum=1)])
+def test_none_is_accepted_if_allowed_and_mentioned_in_the_error(field):
     kind = _settings(field)
     assert kind(field=None).field is None
     assert _refusal(kind, "x").endswith(" or none")
@@ -125,7 +125,7 @@ def test_a_flag_is_true_or_false(value):
         assert _refusal(kind, value) == "true or false"
 
 
-def test_a_choice_is_one_of_its_words():
+def test_a_choice_accepts_its_words_only():
     kind = _settings(choice("one", "one", "two"))
     assert kind(field="two").field == "two"
     for wrong in ("three", "", 1, None):
@@ -136,13 +136,13 @@ def test_a_choice_is_one_of_its_words():
     ("field", "good", "bad", "bound"),
     [
         (
-            units((64,)),
+            positive_integers((64,)),
             [(1,), (), (2, 3)],
             [(0,), (1.5,), [64], (True,), 64],
             "a tuple of integers >= 1",
         ),
         (
-            factors(),
+            positive_reals(),
             [(1.0, 2), None],
             [(0.0,), (-1,), [1.0], (math.inf,), (math.nan,)],
             "a tuple of finite numbers > 0 or none",
@@ -155,7 +155,7 @@ def test_a_choice_is_one_of_its_words():
         ),
     ],
 )
-def test_tuples_hold_what_they_say(field, good, bad, bound):
+def test_tuples_are_validated(field, good, bad, bound):
     kind = _settings(field)
     for value in good:
         assert kind(field=value).field == value
@@ -163,40 +163,40 @@ def test_tuples_hold_what_they_say(field, good, bad, bound):
         assert _refusal(kind, value) == bound
 
 
-# -- names and nested mappings ------------------------------------------------------------------------------
+# -- names and nested mappings ---------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class Inner(Checked):
-    """A part."""
+    """Part of a class."""
 
-    gain: float = real(1.0, least=0.0)
+    gain: float = real(1.0, minimum=0.0)
     limit: float = real(2.0, above=0.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Outer(Checked):
-    """With a part that is there and one that may be."""
+    """Class with a required and an optional part."""
 
-    size: int = integer(1, least=1)
+    size: int = integer(1, minimum=1)
     always: Inner = Inner()
     maybe: Inner | None = part(Inner())
 
 
 @given(st.floats(0, 10), st.integers(1, 9), st.none() | st.floats(0, 10))
-def test_nested_mappings_build_what_they_say(gain, size, other):
+def test_nested_mappings_build_dataclasses(gain, size, maybe_gain):
     mapping = {
         "size": size,
         "always": {"gain": gain},
-        "maybe": None if other is None else {"gain": other},
+        "maybe": None if maybe_gain is None else {"gain": maybe_gain},
     }
-    expected = Outer(size, Inner(gain), None if other is None else Inner(other))
+    expected = Outer(size, Inner(gain), None if maybe_gain is None else Inner(maybe_gain))
     assert build(Outer, mapping, "field") == expected
     assert build(Outer, dataclasses.asdict(expected), "field") == expected
     assert build(Outer, {}, "field") == Outer()
 
 
-def test_parts_are_the_fields_that_hold_dataclasses():
+def test_parts_are_the_fields_with_dataclasses():
     assert parts(Outer) == {"always": Inner, "maybe": Inner}
     assert parts(Inner) == {}
 
@@ -215,25 +215,25 @@ def test_parts_are_the_fields_that_hold_dataclasses():
         ({"size": 1.0}, r"Outer\.size = 1\.0: must be an integer >= 1"),
     ],
 )
-def test_what_no_mapping_of_fields_says_is_refused(mapping, message):
+def test_raises_if_a_mapping_does_not_describe_the_fields(mapping, message):
     with pytest.raises(ValueError, match=message):
         build(Outer, mapping, "field")
 
 
-def test_the_nearest_name_is_suggested_and_no_distant_one():
+def test_the_nearest_name_is_suggested_unless_it_is_distant():
     assert did_you_mean("pendulm", iter(["cartpole", "pendulum"])) == "did you mean 'pendulum'? "
     assert did_you_mean(3, ["33", "cartpole"]) == "did you mean '33'? "
     assert did_you_mean("x", ["cartpole", "pendulum"]) == did_you_mean("x", []) == ""
 
 
 @given(st.lists(WORDS, max_size=4), st.lists(WORDS, min_size=1, max_size=4))
-def test_names_are_refused_exactly_if_they_are_not_known(given_names, known):
-    wrong = [name for name in given_names if name not in known]
+def test_raises_exactly_for_unknown_names(names, known):
+    wrong = [name for name in names if name not in known]
     if not wrong:
-        check_names(given_names, known, "thing")
+        check_names(names, known, "thing")
         return
     with pytest.raises(ValueError, match=re.escape(f"unknown thing in.{wrong[0]}; ")):
-        check_names(given_names, known, "thing", "in.")
+        check_names(names, known, "thing", "in.")
 
 
 FLAGS = [
@@ -245,8 +245,8 @@ FLAGS = [
         "--actuator.supply.voltage",
     ),
     *(
-        f"--actuator.motor.{one}"
-        for one in ("resistance", "inductance", "coulomb-friction", "viscous-friction")
+        f"--actuator.motor.{field}"
+        for field in ("resistance", "inductance", "coulomb-friction", "viscous-friction")
     ),
     *(
         "--actuator.motor.arm-radius",
@@ -280,6 +280,6 @@ FLAGS = [
         },
     }.items(),
 )
-def test_a_suggestion_means_the_same_and_where_nothing_does_there_is_none(flag, near):
-    said = did_you_mean(flag, FLAGS)
-    assert said == (f"did you mean {' or '.join(map(repr, near))}? " if near else "")
+def test_suggestions_have_the_same_meaning_or_are_omitted(flag, near):
+    suggestion = did_you_mean(flag, FLAGS)
+    assert suggestion == (f"did you mean {' or '.join(map(repr, near))}? " if near else "")

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all."""
+"""Atomic writing of files and folders, and digests of JSON."""
 
 import errno
 import json
@@ -7,17 +7,17 @@ import stat
 
 import pytest
 
-from codrl_mj.runs.files import read_json, sealed, write_json, writing
+from codrl_mj.runs.files import atomic_write, read_json, with_digest, write_json
 
 
 @pytest.mark.parametrize("existing", [None, "old and longer"], ids=["new", "there"])
 @pytest.mark.parametrize("name", ["film.mp4", "policy.safetensors", "curve.tar.gz", "nosuffix"])
-def test_a_file_appears_whole_when_its_block_ends(tmp_path, name, existing):
-    """Until then there is a private one beside it, of the same suffix."""
+def test_a_file_appears_complete_when_its_block_ends(tmp_path, name, existing):
+    """Until then there is a private temporary file of the same suffix beside it."""
     target = tmp_path / name
     if existing is not None:
         target.write_text(existing)
-    with writing(target) as temporary:
+    with atomic_write(target) as temporary:
         temporary.write_text("whole")
         assert (target.read_text() if target.exists() else None) == existing
         assert (temporary.suffix, temporary.parent) == (target.suffix, tmp_path)
@@ -32,7 +32,7 @@ def test_an_exception_leaves_the_folder_as_it_was(tmp_path, error, existing):
     target = tmp_path / "result.json"
     if existing is not None:
         target.write_text(existing)
-    with pytest.raises(error), writing(target) as temporary:  # noqa: PT012 - half of the block must run
+    with pytest.raises(error), atomic_write(target) as temporary:  # noqa: PT012 - partial write
         temporary.write_text("half of it")
         raise error
     assert [path.read_text() for path in tmp_path.iterdir()] == (
@@ -52,9 +52,9 @@ def test_a_full_disk_while_writing_json_leaves_nothing(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_failing_to_replace_a_folder_leaves_no_temporary_file(tmp_path):
+def test_a_failed_replacement_leaves_no_temporary_file(tmp_path):
     (tmp_path / "taken").mkdir()
-    with pytest.raises(OSError, match="taken"), writing(tmp_path / "taken") as temporary:
+    with pytest.raises(OSError, match="taken"), atomic_write(tmp_path / "taken") as temporary:
         temporary.write_text("x")
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
@@ -65,15 +65,15 @@ def test_failing_to_replace_a_folder_leaves_no_temporary_file(tmp_path):
 def test_permissions_follow_the_umask(tmp_path, mask, mode):
     before = os.umask(mask)
     try:
-        with writing(tmp_path / "a.txt") as temporary:
+        with atomic_write(tmp_path / "a.txt") as temporary:
             temporary.write_text("x")
-        assert os.umask(mask) == mask  # reading the mask did not change it
+        assert os.umask(mask) == mask  # Reading the mask does not change it.
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == mode
 
 
-def test_json_is_indented_in_folders_that_are_made_and_survives_the_round_trip(tmp_path):
+def test_json_is_indented_in_new_folders_and_read_back(tmp_path):
     write_json(tmp_path / "a" / "b" / "c.json", [1])
     assert (tmp_path / "a" / "b" / "c.json").read_text() == "[\n  1\n]\n"
     content = {
@@ -89,15 +89,15 @@ def test_json_is_indented_in_folders_that_are_made_and_survives_the_round_trip(t
 CONTENT = {"b": {"limit": float("inf"), 10: (1, 2.5), 9: None}, "a": [float("nan"), "ω"], "seed": 3}
 
 
-def test_what_is_sealed_is_read_as_it_was_and_its_order_does_not_matter(tmp_path):
+def test_content_with_a_digest_is_read_in_any_order(tmp_path):
     write_json(tmp_path / "plain.json", CONTENT)
-    write_json(tmp_path / "sealed.json", sealed(CONTENT))
+    write_json(tmp_path / "sealed.json", with_digest(CONTENT))
     content = json.loads((tmp_path / "sealed.json").read_text())
     write_json(tmp_path / "turned.json", dict(reversed(content.items())))
     plain, read, turned = (
         read_json(tmp_path / f"{name}.json", "thing") for name in ("plain", "sealed", "turned")
     )
-    assert repr(read) == repr(plain)  # NaN is not equal to itself
+    assert repr(read) == repr(plain)  # NaN differs from itself, so texts are compared.
     assert sorted(turned) == sorted(plain)
 
 
@@ -113,8 +113,8 @@ def test_what_is_sealed_is_read_as_it_was_and_its_order_does_not_matter(tmp_path
         lambda content: content.update(sha256=7),
     ],
 )
-def test_what_is_sealed_and_was_changed_is_refused_until_its_seal_is_deleted(tmp_path, change):
-    path, content = tmp_path / "a.json", sealed(CONTENT)
+def test_changed_content_is_refused_until_its_digest_is_deleted(tmp_path, change):
+    path, content = tmp_path / "a.json", with_digest(CONTENT)
     change(content)
     write_json(path, content)
     with pytest.raises(
@@ -143,7 +143,7 @@ def test_what_is_sealed_and_was_changed_is_refused_until_its_seal_is_deleted(tmp
     ],
     ids=["empty", "truncated", "text", "binary", "missing", "a folder"],
 )
-def test_what_is_no_json_is_named_with_what_it_should_be(tmp_path, content, error, words):
+def test_raises_if_a_file_is_not_json(tmp_path, content, error, words):
     path = tmp_path / "damaged.json"
     if content == "a folder":
         path.mkdir()

@@ -1,4 +1,4 @@
-"""Run folders that stand in the repository, of an earlier commit: their policies do what they did then."""
+"""Run folders of an earlier commit in the repository: their policies still behave as recorded."""
 
 import json
 from pathlib import Path
@@ -13,31 +13,31 @@ RUNS = Path(__file__).parent / "fixtures" / "runs"
 
 
 @pytest.mark.parametrize("name", ["cartpole", "pendulum"])
-def test_a_policy_does_what_it_did(name):
-    """Noise of the sensor included: what was measured then is beside them.
+def test_a_policy_reproduces_its_recorded_evaluation(name):
+    """The recorded evaluation includes sensor noise.
 
-    Not to the last bit: a network's float32 sums are in another order on another processor.
+    Equality is not exact: a network's float32 sums have another order on another processor.
     """
     run = RUNS / name
-    now = evaluate(
+    current = evaluate(
         load_policy(run), load_config(run).evaluation_env, 2, EVALUATION_SEED
     ).as_mapping()
-    then = json.loads((run / "evaluation.json").read_text())
-    then["units"], now["units"] = None, None  # there are more measures now
-    kept = then.keys() - {"conditions"}
-    assert kept <= now.keys()
-    for name in kept:
-        check_close(json.loads(json.dumps(now[name])), then[name], name)
+    recorded = json.loads((run / "evaluation.json").read_text())
+    recorded["units"], current["units"] = None, None  # Newer versions have more measures.
+    run_folder = recorded.keys() - {"conditions"}
+    assert run_folder <= current.keys()
+    for name in run_folder:
+        check_close(json.loads(json.dumps(current[name])), recorded[name], name)
 
 
-def check_close(ours, theirs, where):
-    """Whatever is in two nested values is the same; numbers to 1e-6 of themselves."""
+def check_close(ours, theirs, path):
+    """Assert that nested values are equal, and numbers up to a relative error of 1e-6."""
     if isinstance(theirs, dict | list):
         keys = theirs.keys() if isinstance(theirs, dict) else range(len(theirs))
-        assert len(ours) == len(theirs), where
+        assert len(ours) == len(theirs), path
         for key in keys:
-            check_close(ours[key], theirs[key], f"{where}/{key}")
+            check_close(ours[key], theirs[key], f"{path}/{key}")
     else:
         assert ours == (pytest.approx(theirs, rel=1e-6) if isinstance(theirs, float) else theirs), (
-            where
+            path
         )

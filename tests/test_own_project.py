@@ -18,7 +18,7 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.physics import PHYSICS
 from codrl_mj.runs.files import write_json
 from codrl_mj.runs.summaries import read_run
-from codrl_mj.study.advice import measurement
+from codrl_mj.study.advice import plan_measurement
 from codrl_mj.tasks import PAPER_TASKS, TASKS, find_task, reference_of
 from codrl_mj.tasks.attributes import Fixed
 from codrl_mj.tasks.reference_env import ReferenceStates
@@ -71,7 +71,7 @@ def register_variation(task=arm.TASK, **fields):
 def test_the_family_runs_in_the_engine_as_in_python():
     env = make_arm(series_elastic.SOFT)
     parameters = codrl_mj.actuators.parameters_type(series_elastic.SeriesElastic)(
-        *series_elastic.SOFT.numbers
+        *series_elastic.SOFT.parameter_values
     )
     states = [series_elastic.State(0.0, 0.0)] * 2
     for action in actions(20, 1)[:, 0]:
@@ -122,7 +122,7 @@ def test_two_motors_have_two_forces_within_their_own_limits():
         ({"actuator": "lag", "physics": "analytic"}, "arm rebuilds no environment of Gymnasium's"),
         (
             {"actuator": "weak"},
-            "'weak': a variation of the paper's actuator, of which arm has none",
+            "'weak': a variation of the paper's actuator, but arm has none",
         ),
     ],
 )
@@ -249,9 +249,9 @@ def test_advice_for_a_run_of_the_arm_is_measured_only_with_trust(tmp_path):
     config = TrainConfig.preset(TASK, AGENT, total_steps=64)
     write_json(tmp_path / "run" / "config.json", {"train": config.as_mapping()})
     with pytest.raises(ValueError, match="--trust"):
-        measurement("lag", str(tmp_path / "run"), 2, tmp_path)
+        plan_measurement("lag", str(tmp_path / "run"), 2, tmp_path)
     assert (
-        measurement("lag", str(tmp_path / "run"), 2, tmp_path, trust=True).home.env.task
+        plan_measurement("lag", str(tmp_path / "run"), 2, tmp_path, trust=True).baseline.env.task
         == config.task
     )
 

@@ -1,4 +1,4 @@
-"""Nothing needs what Windows and macOS lack: file locks of Unix, /proc, fork. (It was not run on either of them.)."""
+"""No use of what Windows and macOS lack: Unix file locks, /proc, fork (not tested on them)."""
 
 import json
 import subprocess
@@ -30,29 +30,29 @@ sys.exit(cli.main(sys.argv[1:]))
 
 
 @pytest.mark.matrix
-def test_everything_is_imported_and_a_policy_trained_without_what_other_systems_lack(tmp_path):
+def test_imports_and_training_use_no_module_that_other_systems_lack(tmp_path):
     words = ["train", "cartpole", "--total-steps", "512", "--out", str(tmp_path / "run")]
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", ELSEWHERE, *words], capture_output=True, text=True, timeout=300
     )
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, process.stderr
     assert json.loads((tmp_path / "run" / "result.json").read_text())["steps"] >= 512
 
 
 @pytest.mark.matrix
 def test_a_run_folder_in_use_is_refused_by_any_lock(tmp_path):
-    """Two processes, one of which holds it."""
+    """Two processes use a run folder, and one of them holds its lock."""
     hold = "import sys; from codrl_mj.training.folder import locked; from pathlib import Path\n"
     hold += "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
     holder = subprocess.Popen(
         [sys.executable, "-c", hold, str(tmp_path)], stdin=-1, stdout=-1, text=True
     )
     assert holder.stdout.readline() == "held\n"
-    other = subprocess.run(
+    lock = subprocess.run(
         [sys.executable, "-c", hold, str(tmp_path)], capture_output=True, text=True, input=""
     )
-    assert "another process is training in it" in other.stderr
-    holder.kill()  # the system lets go of it
+    assert "another process is training in it" in lock.stderr
+    holder.kill()  # The operating system releases the lock.
     holder.wait()
     after = subprocess.run(
         [sys.executable, "-c", hold, str(tmp_path)], capture_output=True, text=True, input=""

@@ -1,4 +1,4 @@
-"""Policies as files: they predict what the model predicted, and nothing in them is executed."""
+"""Policies as files: they predict like the model, and nothing in them is executed."""
 
 import dataclasses
 import hashlib
@@ -36,7 +36,8 @@ SMALL = PPOConfig(rollout_steps=8, batch_size=8, hidden=(8, 8))
 def make_model(action_space=DISCRETE, observation_space=BOUNDED, agent=SMALL):
     torch.set_num_threads(1)
     model = agent.make_model(DummyVecEnv([lambda: Sampled(observation_space, action_space)]), 3)
-    with torch.no_grad():  # initial weights hardly tell observations apart: make the actions vary
+    # With initial weights the actions hardly depend on the observations.
+    with torch.no_grad():
         for parameter in model.policy.parameters():
             parameter.add_(0.5 * torch.randn_like(parameter))
     return model
@@ -44,18 +45,18 @@ def make_model(action_space=DISCRETE, observation_space=BOUNDED, agent=SMALL):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder with a policy."""
+    """Return a folder with a policy."""
     save_policy(make_model().policy, SMALL, tmp_path)
     return tmp_path
 
 
 def observations(count=200):
-    """Many in the midst, and a few far away."""
+    """Return many observations in the center of the space and a few far away."""
     near = np.random.default_rng(0).normal(0.0, 2.0, (count, 4)).astype(np.float32)
     return np.concatenate([near, 100 * near[:5]])
 
 
-# -- round trip ---------------------------------------------------------------------------------------------
+# -- round trip ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -72,19 +73,19 @@ def observations(count=200):
     ],
     ids=lambda value: getattr(value, "name", None),
 )
-def test_a_loaded_policy_is_what_was_saved(tmp_path, agent, action_space):
-    """It has the same spaces, predicts and samples the same, and acts within the bounds."""
-    seen = LIMITED if agent.name == "sarsa" else BOUNDED  # tiles need bounds
-    model = make_model(action_space, seen, agent)
+def test_a_loaded_policy_equals_the_saved_one(tmp_path, agent, action_space):
+    """It has the same spaces, predictions and samples, and acts within the bounds."""
+    observation_space = LIMITED if agent.name == "sarsa" else BOUNDED  # Tiles need bounds.
+    model = make_model(action_space, observation_space, agent)
     save_policy(model.policy, agent, tmp_path)
     loaded = load_policy(tmp_path)
-    assert (loaded.observation_space, loaded.action_space) == (seen, action_space)
+    assert (loaded.observation_space, loaded.action_space) == (observation_space, action_space)
     expected, _ = model.predict(observations(), deterministic=True)
-    assert len(np.unique(expected, axis=0)) > 1  # the comparison is not of one constant action
+    assert len(np.unique(expected, axis=0)) > 1  # The actions differ.
     actions, _ = loaded.predict(observations(), deterministic=True)
     np.testing.assert_array_equal(actions, expected)
     assert all(action in action_space for action in actions)
-    if agent.name in ("ppo", "sac"):  # those that sample from torch's generator
+    if agent.name in ("ppo", "sac"):  # These sample from torch's generator.
         torch.manual_seed(5)
         first, _ = model.predict(observations(), deterministic=False)
         torch.manual_seed(5)
@@ -92,7 +93,7 @@ def test_a_loaded_policy_is_what_was_saved(tmp_path, agent, action_space):
         assert not np.array_equal(first, expected)
 
 
-def test_the_files_are_readable_by_plain_safetensors_json_and_sha256sum(folder):
+def test_safetensors_json_and_sha256sum_can_read_the_files(folder):
     assert sorted(path.name for path in folder.iterdir()) == [DESCRIPTION, WEIGHTS]
     described = json.loads((folder / DESCRIPTION).read_text())
     assert described["agent"]["name"] == "ppo"
@@ -104,26 +105,26 @@ def test_the_files_are_readable_by_plain_safetensors_json_and_sha256sum(folder):
     assert shapes["action_net.weight"] == (3, 8)
 
 
-def test_a_policy_that_cannot_be_described_is_refused_with_nothing_written(tmp_path):
+def test_raises_before_writing_if_a_policy_cannot_be_described(tmp_path):
     with pytest.raises(ValueError, match="only Box and Discrete"):
         save_policy(make_model(spaces.MultiBinary(2)).policy, SMALL, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-# -- damaged and foreign files ------------------------------------------------------------------------------
+# -- damaged and foreign files ---------------------------------------------------------------------
 
 
 def without_digests(content, **changes):
-    """A description as it was before there were any, so that nothing but its content can be wrong."""
+    """Return a description without digests, so that only its content can be wrong."""
     described = json.loads(content)
-    kept = ("format", "agent", "observation_space", "action_space")
-    described = {name: described[name] for name in kept} | changes
+    entries = ("format", "agent", "observation_space", "action_space")
+    described = {name: described[name] for name in entries} | changes
     return json.dumps(
         {name: value for name, value in described.items() if value != "left out"}
     ).encode()
 
 
-def test_a_policy_from_before_there_were_digests_is_loaded(folder):
+def test_a_policy_without_digests_is_loaded(folder):
     (folder / DESCRIPTION).write_bytes(without_digests((folder / DESCRIPTION).read_bytes()))
     expected, _ = make_model().predict(observations(), deterministic=True)
     np.testing.assert_array_equal(
@@ -132,7 +133,7 @@ def test_a_policy_from_before_there_were_digests_is_loaded(folder):
 
 
 @pytest.mark.parametrize("name", [DESCRIPTION, WEIGHTS])
-def test_a_missing_file_is_named(folder, name):
+def test_raises_if_a_file_is_missing(folder, name):
     (folder / name).unlink()
     with pytest.raises(FileNotFoundError, match=str(folder / name)):
         load_policy(folder)
@@ -159,7 +160,7 @@ def test_a_missing_file_is_named(folder, name):
     ],
     ids=str,
 )
-def test_a_description_with_a_wrong_field_is_named(folder, field, value):
+def test_raises_if_a_description_has_a_wrong_field(folder, field, value):
     path = folder / DESCRIPTION
     path.write_bytes(without_digests(path.read_bytes(), **{field: value}))
     with pytest.raises(ValueError, match=f"{path} does not describe a policy"):
@@ -187,7 +188,7 @@ OTHER_FORMATS = ({}, [], 1, None, "codrl_mj policy 2", {"format": "codrl_mj poli
             for keep in (0, 4, 40, -1)
         ),
         (True, WEIGHTS, lambda old: old[:-1], "is truncated or damaged"),
-        (True, WEIGHTS, wider, "do not belong together: its sha256 is not the one"),
+        (True, WEIGHTS, wider, "do not belong together: its sha256 differs"),
         (False, WEIGHTS, wider, "do not belong together: "),
         (False, WEIGHTS, lambda _: save({"weight": torch.zeros(3)}), "do not belong together: "),
         (False, WEIGHTS, not_a_number, "holds weights that are not finite"),
@@ -213,7 +214,9 @@ OTHER_FORMATS = ({}, [], 1, None, "codrl_mj policy 2", {"format": "codrl_mj poli
         ),
     ],
 )
-def test_what_is_damaged_or_another_policys_is_named(folder, digests, name, change, words):
+def test_raises_if_a_file_is_damaged_or_belongs_to_another_policy(
+    folder, digests, name, change, words
+):
     if not digests:
         (folder / DESCRIPTION).write_bytes(without_digests((folder / DESCRIPTION).read_bytes()))
     path = folder / name
@@ -223,13 +226,13 @@ def test_what_is_damaged_or_another_policys_is_named(folder, digests, name, chan
 
 
 def content_of(policy):
-    """All that a policy is, as text and bytes."""
+    """Return all data of a policy as text and bytes."""
     weights = {name: tensor.numpy().tobytes() for name, tensor in policy.state_dict().items()}
     return weights, repr((policy.observation_space, policy.action_space)), repr(policy)
 
 
 @pytest.mark.parametrize("name", [DESCRIPTION, WEIGHTS])
-def test_a_policy_damaged_in_a_few_bytes_is_refused_or_is_what_it_was(folder, name):
+def test_a_policy_with_damaged_bytes_is_refused_or_unchanged(folder, name):
     random_ = random.Random(0)
     path, expected = folder / name, content_of(load_policy(folder))
     whole, refusals = path.read_bytes(), 0
@@ -238,26 +241,26 @@ def test_a_policy_damaged_in_a_few_bytes_is_refused_or_is_what_it_was(folder, na
         try:
             assert (
                 content_of(load_policy(folder)) == expected
-            )  # such as a space for a line break in the JSON
+            )  # For example a space instead of a line break in the JSON.
         except ValueError as error:
             assert str(folder) in str(error)  # noqa: PT017 - most of them raise, not all
             refusals += 1
-    assert refusals >= (100 if name == DESCRIPTION else 150)  # of the weights every byte counts
+    assert refusals >= (100 if name == DESCRIPTION else 150)  # Every byte of the weights counts.
 
 
 @pytest.mark.parametrize("name", [WEIGHTS, DESCRIPTION])
 @pytest.mark.parametrize("through", [pickle.dump, torch.save], ids=["pickle", "torch"])
-def test_a_pickle_in_place_of_a_file_is_refused_and_not_executed(folder, name, through):
+def test_a_pickle_instead_of_a_file_is_refused_and_not_executed(folder, name, through):
     with (folder / name).open("wb") as file:
         through(Bomb(folder / "executed"), file)
-    if name == WEIGHTS:  # whatever its digest
+    if name == WEIGHTS:  # The digest does not matter.
         (folder / DESCRIPTION).write_bytes(without_digests((folder / DESCRIPTION).read_bytes()))
     with pytest.raises(ValueError, match=str(folder / name)):
         load_policy(folder)
     assert not (folder / "executed").exists()
 
 
-def test_loading_never_calls_unpickling_code(folder, monkeypatch):
+def test_loading_never_unpickles(folder, monkeypatch):
     for module, name in (
         (pickle, "load"),
         (pickle, "loads"),
@@ -268,10 +271,10 @@ def test_loading_never_calls_unpickling_code(folder, monkeypatch):
     load_policy(folder)
 
 
-# -- Stable-Baselines3's own files --------------------------------------------------------------------------
+# -- Stable-Baselines3's own files -----------------------------------------------------------------
 
 
-def test_a_zip_is_opened_on_trust_alone_and_predicts_what_the_model_does(tmp_path):
+def test_a_zip_is_opened_only_with_trust_and_predicts_like_the_model(tmp_path):
     model, path, executed = make_model(), tmp_path / "model.zip", tmp_path / "executed"
     model.bomb = Bomb(executed)
     model.save(path)
@@ -281,4 +284,4 @@ def test_a_zip_is_opened_on_trust_alone_and_predicts_what_the_model_does(tmp_pat
     policy = load_sb3_zip(path, "ppo", trust=True)
     expected, _ = model.predict(observations(), deterministic=True)
     np.testing.assert_array_equal(policy.predict(observations(), deterministic=True)[0], expected)
-    assert executed.exists()  # this is what the flag is about
+    assert executed.exists()  # This is the danger that the flag guards.

@@ -1,4 +1,4 @@
-"""Run folders: what is read from them, whatever is missing or damaged, and how they are compared."""
+"""Run folders: reading incomplete and damaged ones, and comparing them."""
 
 import datetime
 import hashlib
@@ -12,8 +12,8 @@ from codrl_mj.actuators import (
     CurrentLoop,
     DCMotorActuator,
     Motor,
-    actuator_over,
     mapping_of,
+    override_actuator,
     resolve,
 )
 from codrl_mj.cli import main
@@ -30,14 +30,14 @@ PROGRESS = "steps,episodes,mean_return,steps_per_second,seconds\n"
 UNITS = {"returns": "reward", "tracking_rms": "N*m", "peak_voltage": "V"}
 
 
-GEARED = actuator_over(resolve("kraken-x60", None, "nobody"), {"motor": {"gear_ratio": 70.3}})
-OWN = actuator_over(GEARED, {"motor": {"resistance": 0.5}})
+GEARED = override_actuator(resolve("kraken-x60", None, "nobody"), {"motor": {"gear_ratio": 70.3}})
+OWN = override_actuator(GEARED, {"motor": {"resistance": 0.5}})
 
 
 def make_run(
     folder, actuator="weaker", *, seed=3, task="cartpole", finished=True, evaluated=True, **train
 ):
-    """A run folder as trainings leave them."""
+    """Write a run folder as trainings do."""
     motor = named_actuator(actuator, task) if isinstance(actuator, str) else actuator
     env = {"task": task, "actuator": mapping_of(motor), "disturbances": {"command_delay": 0.0}}
     agent = {"name": "ppo", "learning_rate": 1e-3, "hidden": [64, 64]}
@@ -48,11 +48,12 @@ def make_run(
         f"{PROGRESS}1000,9,20.5,500,2.5\n{last},12,90.25,500,4.5\n"
     )
     if finished:
-        for place in (folder, folder / "best"):
+        for policy_folder in (folder, folder / "best"):
             write_json(
-                place / "policy.json", {"weights_sha256": hashlib.sha256(b"weights").hexdigest()}
+                policy_folder / "policy.json",
+                {"weights_sha256": hashlib.sha256(b"weights").hexdigest()},
             )
-            (place / "policy.safetensors").write_bytes(b"weights")
+            (policy_folder / "policy.safetensors").write_bytes(b"weights")
         write_json(folder / "result.json", {"steps": 4096, "mean_return": 91.0, "seconds": 8.25})
     if evaluated:
         returns = {"mean": 400.0 + seed, "low": 380.0, "high": 420.0}
@@ -61,7 +62,7 @@ def make_run(
     return folder
 
 
-def test_a_finished_run_says_what_it_was_and_what_it_came_to(tmp_path):
+def test_a_finished_run_has_its_configuration_and_results(tmp_path):
     folder = make_run(tmp_path / "mine")
     for index, file in enumerate(sorted(folder.iterdir())):
         os.utime(file, (0, 1_700_000_000 + index))
@@ -72,7 +73,7 @@ def test_a_finished_run_says_what_it_was_and_what_it_came_to(tmp_path):
     assert (run.mean_return, run.evaluation_return) == (
         90.25,
         403.0,
-    )  # the last report's, the evaluation's
+    )  # From the last report, and from the evaluation.
     assert run.configuration["env.disturbances.command_delay"] == 0.0
     assert run.configuration["versions.torch"] == "2.13.0"
     mapping = json.loads(json.dumps(run.as_mapping()))
@@ -87,7 +88,7 @@ def test_a_finished_run_says_what_it_was_and_what_it_came_to(tmp_path):
 @pytest.mark.parametrize(
     "rest", ["", "3000,1", "3000,15,9"], ids=["whole", "half a row", "most of a row"]
 )
-def test_an_unfinished_run_stands_where_its_last_whole_report_says(tmp_path, rest):
+def test_an_unfinished_run_has_the_state_of_its_last_complete_report(tmp_path, rest):
     folder = make_run(tmp_path / "mine", finished=False, evaluated=False)
     with (folder / "progress.csv").open("a") as file:
         file.write(rest)
@@ -96,7 +97,7 @@ def test_an_unfinished_run_stands_where_its_last_whole_report_says(tmp_path, res
     assert run.evaluation_return is None
 
 
-def test_the_time_of_a_run_without_a_clock_follows_from_its_pace(tmp_path):
+def test_the_time_of_a_run_without_seconds_follows_from_its_steps_per_second(tmp_path):
     folder = make_run(tmp_path / "mine", finished=False)
     (folder / "progress.csv").write_text(
         "steps,total_steps,mean_return,mean_length,steps_per_second\n3000,4000,nan,,750"
@@ -111,18 +112,22 @@ def test_the_time_of_a_run_without_a_clock_follows_from_its_pace(tmp_path):
         ("ideal", "cartpole", "ideal"),
         ("paper", "acrobot", "paper"),
         ("open_loop", "pendulum", "open_loop"),
-        (named_actuator("paper", "cartpole"), "pendulum", "custom"),  # named, but not on this task
+        (
+            named_actuator("paper", "cartpole"),
+            "pendulum",
+            "custom",
+        ),  # Named, but not for this task.
         (DCMotorActuator(Motor(resistance=7.0)), "pendulum", "custom"),
         (DCMotorActuator(Motor(), CurrentLoop(max_voltage=float("inf"))), "pendulum", "custom"),
-        (GEARED, "cartpole", "kraken-x60"),  # known by its numbers, whatever its gear
+        (GEARED, "cartpole", "kraken-x60"),  # Recognized by its numbers, with any gear.
         (OWN, "cartpole", "drive"),
     ],
 )
-def test_the_actuator_has_its_name_on_the_task(tmp_path, actuator, task, name):
+def test_the_actuator_has_its_name_for_the_task(tmp_path, actuator, task, name):
     assert read_run(make_run(tmp_path / "mine", actuator, task=task)).actuator == name
 
 
-def test_motors_keep_the_names_that_the_run_was_told(tmp_path):
+def test_motors_keep_the_labels_of_the_run(tmp_path):
     patterns = {"a": "kraken-x60", "b": {"label": "drawer", **OWN.as_mapping()}, "c": None}
     config, folder = TrainConfig(EnvConfig("HalfCheetah-v5", patterns)), tmp_path / "told"
     begin(folder, config)
@@ -139,7 +144,7 @@ def test_motors_keep_the_names_that_the_run_was_told(tmp_path):
 
 
 @pytest.mark.parametrize("actuator", [{"motor": {"colour": 3}}, 7, [["weaker"]]])
-def test_an_actuator_that_cannot_be_read_is_custom(tmp_path, actuator):
+def test_an_unreadable_actuator_is_called_custom(tmp_path, actuator):
     env = {"task": "cartpole", "actuator": actuator}
     assert read_run(make_run(tmp_path / "mine", env=env)).actuator == "custom"
 
@@ -176,14 +181,12 @@ def test_an_actuator_that_cannot_be_read_is_custom(tmp_path, actuator):
         ),
     ],
 )
-def test_a_damaged_run_is_listed_with_what_is_wrong_among_the_others(
-    tmp_path, file, content, problem
-):
+def test_a_damaged_run_is_listed_with_its_problem(tmp_path, file, content, problem):
     make_run(tmp_path / "fine")
     folder = make_run(tmp_path / "hurt")
     (folder / file).unlink() if content is None else (folder / file).write_bytes(content)
-    fine, hurt = find_runs(tmp_path)
-    assert fine.state == "finished"
+    intact, hurt = find_runs(tmp_path)
+    assert intact.state == "finished"
     assert hurt.state == "damaged"
     assert problem in hurt.problem
     assert (hurt.seed == 3) == (file != "config.json")
@@ -207,7 +210,7 @@ def test_a_damaged_run_is_listed_with_what_is_wrong_among_the_others(
         {"train": {"agent": {}, "actuator": None}, "versions": 1},
     ],
 )
-def test_a_configuration_with_little_in_it_is_no_damage(tmp_path, content):
+def test_an_almost_empty_configuration_is_not_damage(tmp_path, content):
     (tmp_path / "config.json").write_text(json.dumps(content))
     (run,) = find_runs(tmp_path)
     assert (run.state, run.seed, run.task, run.steps) == ("unfinished", None, None, None)
@@ -216,7 +219,7 @@ def test_a_configuration_with_little_in_it_is_no_damage(tmp_path, content):
     compare([run, run])
 
 
-def test_runs_are_found_at_any_depth_but_not_in_each_other_nor_in_hidden_folders(tmp_path):
+def test_runs_are_found_at_any_depth_except_in_runs_and_hidden_folders(tmp_path):
     make_run(tmp_path / "b")
     make_run(tmp_path / "deep" / "er" / "a")
     make_run(tmp_path / "b" / "inner")
@@ -231,12 +234,12 @@ def test_runs_are_found_at_any_depth_but_not_in_each_other_nor_in_hidden_folders
         read_run(tmp_path / "empty")
 
 
-def test_runs_are_sorted_by_any_key_with_those_that_lack_it_last(tmp_path):
+def test_runs_are_sorted_by_any_key_with_missing_values_last(tmp_path):
     make_run(tmp_path / "a", "weaker", seed=1)
     make_run(tmp_path / "b", "ideal", seed=2)
     make_run(
         tmp_path / "c", "paper", finished=False, evaluated=False
-    )  # its last training return: 90.25
+    )  # Its last training return is 90.25.
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "config.json").write_text("{")
     runs = find_runs(tmp_path)
@@ -244,13 +247,13 @@ def test_runs_are_sorted_by_any_key_with_those_that_lack_it_last(tmp_path):
     assert order("name") == "abcd"
     assert order("return") == "bacd"
     assert order("actuator") == "bcad"
-    assert order("state") == "dbac"  # damaged, finished, unfinished; ties as they were
+    assert order("state") == "dbac"  # Damaged, finished, unfinished; ties keep their order.
     assert order("steps")[-2:] == "cd"
     with pytest.raises(ValueError, match=r"sort = 'size': must be one of name, task"):
         sort_runs(runs, "size")
 
 
-def test_a_comparison_has_the_settings_that_differ_and_every_result(tmp_path):
+def test_a_comparison_has_differing_settings_and_all_results(tmp_path):
     weak = DCMotorActuator(Motor(arm_radius=0.15), CurrentLoop(kp=0.2, ki=0.3))
     runs = [
         read_run(make_run(tmp_path / "a", "weaker", seed=1)),
@@ -270,12 +273,12 @@ def test_a_comparison_has_the_settings_that_differ_and_every_result(tmp_path):
     assert comparison.results["state"] == ("finished", "finished", "unfinished")
     assert comparison.results["steps"] == (4096, 4096, 2000)
     assert comparison.results["evaluation.tracking_rms"] == (0.1, 0.1, None)
-    assert [one and one["mean"] for one in comparison.results["evaluation.returns"]] == [
+    assert [values and values["mean"] for values in comparison.results["evaluation.returns"]] == [
         401.0,
         402.0,
         None,
     ]
-    assert "evaluation.peak_voltage" not in comparison.results  # none of them has it
+    assert "evaluation.peak_voltage" not in comparison.results  # None of them has it.
     json.dumps(vars(comparison))
     assert comparison.units == {
         "seconds": "s",
@@ -287,15 +290,15 @@ def test_a_comparison_has_the_settings_that_differ_and_every_result(tmp_path):
         compare(runs[:1])
 
 
-def test_beside_an_ideal_actuator_no_field_of_another_is_listed(tmp_path):
+def test_fields_of_actuators_are_not_compared_with_an_ideal_one(tmp_path):
     runs = [read_run(make_run(tmp_path / name, name)) for name in ("ideal", "weaker")]
     assert compare(runs).configuration == {"env.actuator": ("ideal", "weaker")}
 
 
-# -- codrl-mj runs ------------------------------------------------------------------------------------------
+# -- codrl-mj runs ---------------------------------------------------------------------------------
 
 
-def test_the_verb_lists_runs_in_the_order_asked_for(tmp_path, capsys, monkeypatch):
+def test_the_verb_lists_runs_in_the_requested_order(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     make_run(Path("low"), seed=1)
     make_run(Path("high"), seed=50)

@@ -1,4 +1,4 @@
-"""What memory does not hold is refused by its numbers, before anything is computed or written."""
+"""Requests beyond the free memory raise with their sizes before anything is computed or written."""
 
 import dataclasses
 
@@ -13,23 +13,23 @@ from codrl_mj.evaluation import RandomPolicy, check_episodes, run_episodes
 from codrl_mj.identify.plan import plan
 from codrl_mj.identify.synthetic import Excitation, Sampler, simulate
 from codrl_mj.sizing import find_drive
-from codrl_mj.sizing.loop import step
+from codrl_mj.sizing.loop import step_responses
 
 MOTOR = "maxon-ec45-flat-50w"
 
 
 @pytest.fixture
 def small(monkeypatch):
-    """A machine with a gigabyte of free memory."""
+    """Simulate a machine with 1 GB of free memory."""
     monkeypatch.setattr(fields, "free_memory", lambda: 10**9)
 
 
-def test_the_free_memory_is_that_of_the_system():
+def test_the_free_memory_is_read_from_the_system():
     free = fields.free_memory()
     assert free is None or 10**7 < free < 10**14
 
 
-def test_what_fits_is_not_refused(small):
+def test_raises_only_beyond_the_free_memory(small):
     fields.check_memory(0.99e9, "a thing", "remedy")
     with pytest.raises(
         ValueError, match=r"^a thing: about 1.01 GB of memory, of which 1 are free; remedy$"
@@ -38,9 +38,9 @@ def test_what_fits_is_not_refused(small):
 
 
 @pytest.mark.parametrize(
-    ("line", "says"),
+    ("line", "message"),
     [
-        # 20 kHz is the drive's rate, 5 kHz that of the rows
+        # The drive's rate is 20 kHz, that of the rows 5 kHz.
         (
             "--duration 1e5",
             "100,000 s are 2,000,000,000 samples of the drive and 500,000,000 rows: about",
@@ -49,17 +49,17 @@ def test_what_fits_is_not_refused(small):
     ],
 )
 @pytest.mark.usefixtures("small")
-def test_a_simulated_log_is_refused_before_it_begins(tmp_path, monkeypatch, capsys, line, says):
+def test_raises_before_a_large_log_is_simulated(tmp_path, monkeypatch, capsys, line, message):
     monkeypatch.chdir(tmp_path)
     assert main(["identify", "simulate", MOTOR, "--out", "day.csv", *line.split()]) == 2
     error = capsys.readouterr().err
-    assert says in error
+    assert message in error
     assert "shorten the duration (--duration)" in error
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.usefixtures("small")
-def test_sizes_are_refused_from_python_too():
+def test_python_calls_raise_too():
     drive = find_drive(MOTOR)
     with pytest.raises(ValueError, match="2,000,000,000 samples"):
         simulate(drive, Excitation("prbs", 6.0, 1e5))
@@ -73,11 +73,11 @@ def test_sizes_are_refused_from_python_too():
     with pytest.raises(
         ValueError, match=r"sample_rate = 1e\+12: 120,000,000,000 samples of a step: .*; lower it"
     ):
-        step(fast)
+        step_responses(fast)
 
 
 @pytest.mark.usefixtures("small")
-def test_episodes_side_by_side_are_refused():
+def test_raises_for_too_many_parallel_episodes():
     env = EnvConfig("cartpole")
     with pytest.raises(
         ValueError,
@@ -89,8 +89,8 @@ def test_episodes_side_by_side_are_refused():
     check_episodes(100)
 
 
-def test_an_episode_that_does_not_end_stops_before_memory_does(monkeypatch):
-    """It is asked again while it grows: here there is nothing left after 10,000 steps of it."""
+def test_an_endless_episode_stops_before_the_memory_is_full(monkeypatch):
+    """Simulate memory that is full after 10,000 steps; it is checked as the episode grows."""
     monkeypatch.setattr("codrl_mj.evaluation.episodes._STEPS_BETWEEN_CHECKS", 50)
     free = iter([10**12, *[0] * 10])
     monkeypatch.setattr(fields, "free_memory", lambda: next(free))
@@ -102,10 +102,10 @@ def test_an_episode_that_does_not_end_stops_before_memory_does(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("agent", "sizes", "says"),
+    ("agent", "sizes", "message"),
     [
-        # of pendulum: 3 numbers seen and 1 done, 4 bytes each; a replayed step is seen before and
-        # after
+        # A step of pendulum has 3 observed and 1 commanded numbers of 4 bytes; replay buffers store
+        # the observations before and after it.
         (
             "ppo",
             {"rollout_steps": 10**9, "batch_size": 1000},
@@ -115,10 +115,10 @@ def test_an_episode_that_does_not_end_stops_before_memory_does(monkeypatch):
     ],
 )
 @pytest.mark.usefixtures("small")
-def test_buffers_of_agents_are_refused(agent, sizes, says):
+def test_raises_if_agents_buffers_are_too_large(agent, sizes, message):
     space = EnvConfig("pendulum").make()
     many = type("Many", (), {"num_envs": 1, "observation_space": space.observation_space})()
     many.action_space = space.action_space
     assert np.prod(space.observation_space.shape) == 3
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         AGENTS[agent](**sizes).make_model(many, 0)

@@ -1,4 +1,4 @@
-"""Tables: they fit the terminal, and hold the numbers that they are of."""
+"""Tables in the terminal: width and content."""
 
 import contextlib
 import io
@@ -12,7 +12,7 @@ from codrl_mj.evaluation import MEASURES, RandomPolicy, evaluate
 
 @pytest.fixture(scope="module")
 def results():
-    """Evaluations of random policies, by task and actuator."""
+    """Return evaluations of random policies by task and actuator."""
     return {
         (task, actuator): evaluate(
             RandomPolicy(task), EnvConfig(task, actuator, max_episode_steps=30), episodes=3
@@ -27,13 +27,13 @@ def results():
 
 
 def printed(evaluations, **options):
-    """The tables as lines of a terminal, without the space at their ends."""
+    """Return the tables as lines of a terminal, without trailing spaces."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
         print_evaluations(evaluations, **options)
     return [line.rstrip() for line in out.getvalue().splitlines()]
 
 
-def test_a_row_has_the_most_telling_measures(results):
+def test_a_row_has_the_main_measures(results):
     result = results["cartpole", "weaker"]
     lines = printed({"mine": result}, details=False)
     (row,) = (line for line in lines if "mine" in line)
@@ -46,20 +46,20 @@ def test_a_row_has_the_most_telling_measures(results):
     assert "3 episodes per row" in lines[0]
 
 
-def test_what_an_ideal_actuator_does_not_have_is_a_dash(results):
+def test_missing_measures_of_an_ideal_actuator_are_dashes(results):
     lines = printed(
         {"perfect": results["cartpole", "ideal"], "mine": results["cartpole", "weaker"]}
     )
     (row,) = (line for line in lines if line.split()[:1] == ["perfect"])
     assert row.split()[-3:] == ["–", "–", "–"]
-    alone = "\n".join(printed({"perfect": results["cartpole", "ideal"]}))
-    assert "|u|" not in alone  # nor is there a column of dashes
-    assert "copper" not in alone
-    assert "time" not in alone.split("measure")[0]  # a pole has no time to a goal
+    ideal_table = "\n".join(printed({"perfect": results["cartpole", "ideal"]}))
+    assert "|u|" not in ideal_table  # No column consists of dashes.
+    assert "copper" not in ideal_table
+    assert "time" not in ideal_table.split("measure")[0]  # A pole has no time to goal.
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])
-def test_tables_fit_and_break_no_number(results, count):
+def test_tables_fit_the_terminal_without_breaking_numbers(results, count):
     names = [
         f"a policy with a long name, the {index}th of them, on [some] actuator"
         for index in range(count)

@@ -35,18 +35,18 @@ def error_message(call, beginning=r"slips?\.py:\d+, in "):
     return str(error_info.value)
 
 
-def name_of(case):
+def display_name(case):
     return str(case).partition(" at 0x")[0][:30]
 
 
-@pytest.mark.parametrize(("field", "value"), slips.TASKS, ids=name_of)
+@pytest.mark.parametrize(("field", "value"), slips.TASKS, ids=display_name)
 def test_raises_for_a_task_with_a_mistake(field, value):
     error_message(
         lambda: slips.task(**{field: value}), r"slips?\.py:\d+, in |Task\.|unknown integrator"
     )
 
 
-@pytest.mark.parametrize(("part", "value"), slips.FAMILIES, ids=name_of)
+@pytest.mark.parametrize(("part", "value"), slips.FAMILIES, ids=display_name)
 def test_raises_for_a_family_with_a_mistake_before_it_is_compiled(part, value, monkeypatch):
     family = slips.family(**{part: value})
     monkeypatch.setattr(sys.modules[__name__], "FAMILY", family)
@@ -72,7 +72,7 @@ def test_raises_for_a_family_without_dataclass_or_advance():
 NUMBA = (*slips.LATE[1:], *slips.LATE_FAMILIES)
 
 
-@pytest.mark.parametrize(("name", "body"), matrix_params(NUMBA[::4], NUMBA), ids=name_of)
+@pytest.mark.parametrize(("name", "body"), matrix_params(NUMBA[::4], NUMBA), ids=display_name)
 def test_errors_of_numba_become_one_sentence(name, body):
     if name in slips.PARTS:
         family = slips.family(**{name: body})

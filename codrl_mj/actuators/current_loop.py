@@ -1,10 +1,10 @@
-"""The paper's actuator, family `current_loop`: a DC motor whose winding is driven by a PID current loop.
+"""The paper's actuator, family `current_loop`: a DC motor with a PID current loop.
 
 Source of the equations and of the defaults: *Control-Optimized Deep Reinforcement Learning* (arXiv
 2507.00268), Methodology; "the paper" below.
 
 `advance` is plain Python on purpose: numba compiles it for MuJoCo's control callback and actuator
-plugin, and it also runs as it stands, in the analytic physics and in the stability analysis.
+plugin, and the same source runs uncompiled in the analytic physics and in the stability analysis.
 """
 
 import dataclasses
@@ -21,10 +21,10 @@ from codrl_mj.fields import Checked, flag, integer, part, real
 
 @dataclasses.dataclass(frozen=True)
 class Motor(Checked):
-    """A brushed DC motor: a winding (R, L) whose current makes torque and whose speed makes voltage.
+    """Brushed DC motor: resistance and inductance of the winding, torque and back-EMF constants.
 
-    L di/dt = u - kE*omega - R*i and torque = kT*i (the paper, eqs. for the current update and the
-    torque).
+    L di/dt = u - kE*omega - R*i and torque = kT*i (the paper, equations of the current update and
+    of the torque).
 
     Raises:
         ValueError: a field is not a finite number within its bound; the message names field, value
@@ -37,8 +37,10 @@ class Motor(Checked):
     """Winding inductance L [H], > 0. The paper: 0.1, all tasks."""
     torque_constant: float = real(1.0, above=0.0, unit="N*m/A")
     """Torque constant kT [N*m/A], > 0. The paper: 1, all tasks."""
-    back_emf_constant: float = real(1.0, least=0.0, unit="V*s/rad")
-    """Back-EMF constant kE [V*s/rad], >= 0; equal to kT in SI units for an ideal motor. The paper: 1."""
+    back_emf_constant: float = real(1.0, minimum=0.0, unit="V*s/rad")
+    """Back-EMF constant kE [V*s/rad], >= 0; in SI units equal to kT for an ideal motor. The paper:
+    1, all tasks.
+    """
     arm_radius: float = real(1.0, above=0.0, unit="m")
     """Arm r [m] between shaft and load, > 0: torque = r*F and omega = v/r. On a hinge it is the
     inverse of the gear ratio (no unit). The paper: 0.15 for CartPole, else 1.
@@ -46,13 +48,13 @@ class Motor(Checked):
 
     @property
     def electrical_time_constant(self) -> float:
-        """L/R [s]: how fast the current would follow a voltage step with no loop around it."""
+        """Time constant L/R [s] of the current after a step of voltage, without a loop."""
         return self.inductance / self.resistance
 
 
 @dataclasses.dataclass(frozen=True)
 class CurrentLoop(Checked):
-    """The PID loop that chooses the motor's terminal voltage from desired and measured current.
+    """PID loop that computes the motor's terminal voltage from desired and measured current.
 
     u = sat(kp*e + ki*I + kd*D + kff*i_ref + kE*omega, +-max_voltage), with e = i_ref - i.
 
@@ -61,70 +63,82 @@ class CurrentLoop(Checked):
             and bound.
     """
 
-    kp: float = real(1.0, least=0.0, unit="V/A")
+    kp: float = real(1.0, minimum=0.0, unit="V/A")
     """Proportional gain [V/A], >= 0."""
-    ki: float = real(0.0, least=0.0, unit="V/(A*s)")
+    ki: float = real(0.0, minimum=0.0, unit="V/(A*s)")
     """Integral gain [V/(A*s)], >= 0."""
-    kd: float = real(0.0, least=0.0, unit="V*s/A")
+    kd: float = real(0.0, minimum=0.0, unit="V*s/A")
     """Derivative gain [V*s/A], >= 0."""
-    kff: float = real(0.0, least=0.0, unit="V/A")
-    """Feed-forward gain on the reference current [V/A], >= 0; kff = R holds the current without feedback."""
+    kff: float = real(0.0, minimum=0.0, unit="V/A")
+    """Feed-forward gain on the reference current [V/A], >= 0; kff = R holds the current without
+    feedback.
+    """
     max_voltage: float = real(24.0, above=0.0, unit="V", infinite=True)
-    """Supply limit u_max [V], > 0; `inf` for none. The paper gives no value: 24 V never saturates at its settings."""
+    """Voltage limit u_max [V], > 0; `inf` for none. The paper gives no value: 24 V never saturates
+    with its settings.
+    """
     bemf_compensation: bool = flag(True)
-    """Add kE*omega to the voltage, which cancels the back-EMF unless the voltage saturates. The paper: yes."""
-    substeps: int = integer(1, least=1)
-    """Electrical steps within one mechanical step, >= 1: for winding time constants below the mechanical step."""
-    integral_leak: float = real(0.0, least=0.0, unit="1/s")
-    """Leak rate of the integral [1/s], >= 0: the paper appendix's low-pass form of the integral. 0: a plain sum."""
-    derivative_time_constant: float = real(0.0, least=0.0, unit="s")
-    """Time constant [s] of the low-pass on the derivative, >= 0: the appendix's high-pass form of
-    the derivative. 0: the plain difference of two samples.
+    """Add kE*omega to the voltage, which cancels the back-EMF unless the voltage saturates. The
+    paper: yes.
+    """
+    substeps: int = integer(1, minimum=1)
+    """Electrical steps per mechanical step, >= 1: for electrical time constants below the
+    mechanical step.
+    """
+    integral_leak: float = real(0.0, minimum=0.0, unit="1/s")
+    """Leak rate of the integral [1/s], >= 0: the low-pass form of the integral in the paper's
+    appendix. 0: a plain sum.
+    """
+    derivative_time_constant: float = real(0.0, minimum=0.0, unit="s")
+    """Time constant [s] of the low-pass filter on the derivative, >= 0: the high-pass form of the
+    derivative in the paper's appendix. 0: the plain difference of two samples.
     """
     current_bias: float = real(0.0, unit="A")
-    """Offset of the current sensor [A]: the controller measures the current plus this."""
-    current_noise: float = real(0.0, least=0.0, unit="A")
-    """Standard deviation [A] of the current sensor's white noise, >= 0: a new value for each electrical step."""
+    """Offset of the current sensor [A], added to the current that the controller measures."""
+    current_noise: float = real(0.0, minimum=0.0, unit="A")
+    """Standard deviation [A] of the current sensor's white noise, >= 0: a new value in each
+    electrical step.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
 class Supply(Checked):
-    """What feeds the drive: a voltage behind a resistance.
+    """Power supply of the drive: a voltage source with an internal resistance.
 
     Raises:
         ValueError: a field is out of bounds; the message names field, value and bound.
     """
 
     voltage: float = real(math.inf, above=0.0, unit="V", infinite=True)
-    """Open-circuit voltage [V], > 0; the terminal voltage is limited by the controller's
-    `max_voltage` as well. `inf`: the controller's `max_voltage`.
+    """Open-circuit voltage [V], > 0; the controller's `max_voltage` limits the terminal voltage,
+    too. `inf`: the controller's `max_voltage`.
     """
-    resistance: float = real(0.0, least=0.0, unit="ohm")
-    """Resistance [ohm], >= 0: the voltage that is available sags by resistance*|current|."""
+    resistance: float = real(0.0, minimum=0.0, unit="ohm")
+    """Internal resistance [ohm], >= 0: the available voltage drops by resistance*|current|."""
 
 
 class State(NamedTuple):
-    """What the loop remembers."""
+    """State of the current loop."""
 
     current: float
     """Motor current i [A]."""
     integral: float
     """Integral of the current error [A*s]."""
     error: float
-    """Current error of the last electrical step [A]; low-passed when the derivative filter is on."""
+    """Current error of the last electrical step [A]; low-passed if the derivative filter is on."""
 
 
 class Signals(NamedTuple):
-    """What can be seen of the loop at the end of a step."""
+    """Signals of the loop at the end of a step."""
 
     current: float
     """Motor current [A]."""
     reference_current: float
-    """Current asked of the loop [A], by the command as it arrived."""
+    """Reference current [A] of the loop, from the command after all disturbances."""
     voltage: float
     """Terminal voltage [V] of the last electrical step."""
     saturated: float
-    """1 where that voltage was at its limit."""
+    """1 if that voltage was at its limit."""
 
 
 def advance(
@@ -132,18 +146,18 @@ def advance(
 ) -> tuple[State, float, Signals]:
     """Advance the loop by one mechanical step, with desired torque and speed held over it.
 
-    The paper's Algorithm 1 (function DCMotorENVStep), with its CartPole feed-forward and its
-    appendix's filters, repeated `substeps` times with timestep/substeps. With both filters off,
-    every operation is the paper's.
+    The equations are the paper's Algorithm 1 (function DCMotorENVStep), with its CartPole
+    feed-forward and the filters of its appendix, repeated `substeps` times with timestep/substeps.
+    With both filters off, every operation is the paper's.
 
-    The integral leaks as dI/dt = e - leak*I and the derivative is that of the error seen through
-    1/(1 + Td*s); both by backward Euler, so they are stable at any step and become the paper's sum
+    The integral leaks as dI/dt = e - leak*I, and the derivative is that of the error filtered by
+    1/(1 + Td*s). Both use backward Euler, so they are stable at any step and become the paper's sum
     and difference at leak = 0 and Td = 0.
 
-    The controller reads i + current_bias + current_noise*n, with a new standard normal n for each
-    electrical step, a function of key, time and electrical step: whoever computes the step again
-    gets it again. The voltage that is available is the least of max_voltage and the supply's, which
-    sags with the current at the electrical step's start.
+    The controller reads i + current_bias + current_noise*n, with a standard normal n for each
+    electrical step that is a function of key, time and electrical step: computing the step again
+    gives the same value. The available voltage is the smaller of max_voltage and the supply's
+    voltage, which drops with the current at the start of the electrical step.
 
     Args:
         parameters: named as the fields of `DCMotorActuator` and its parts.
@@ -167,6 +181,8 @@ def advance(
             sensor_error += parameters.current_noise * noise.standard_normal(
                 inputs.noise_key, step, substep
             )
+        # The callback may be called at intermediate times of a step, so the step's number is
+        # rounded.
         if parameters.supply_resistance > 0.0:
             sag = parameters.supply_resistance * abs(current)
             available = min(parameters.max_voltage, max(open_circuit - sag, 0.0))
@@ -198,7 +214,7 @@ def electrical_step(
     sensor_error: float,
     limit: Any,
 ) -> tuple[Any, Any, Any, Any]:
-    """One sample of the controller and one step of the winding: the only place where their equations stand.
+    """Advance controller and winding by one sample; all uses of the equations call this.
 
     Args:
         parameters: as for `advance`; each may be an array.
@@ -208,11 +224,11 @@ def electrical_step(
         previous_error: [A].
         desired_torque: [N*m].
         speed: [rad/s].
-        sensor_error: measured minus real current [A].
+        sensor_error: measured minus actual current [A].
         limit: largest magnitude of the voltage [V].
 
     Returns:
-        Current [A], integral [A*s] and error [A] afterwards, and the voltage [V].
+        New current [A], integral [A*s] and error [A], and the voltage [V].
     """
     back_emf = parameters.back_emf_constant * speed
     reference = desired_torque / parameters.torque_constant
@@ -235,7 +251,7 @@ def electrical_step(
 def observe(
     parameters: Any, timestep: float, signals: Signals, inputs: Inputs
 ) -> tuple[float, float]:
-    """The current [A] that the sensor measures at present, at the first electrical step to come, and the reference."""
+    """Return the measured current [A] of the next electrical step, and the reference [A]."""
     error = parameters.current_bias
     if parameters.current_noise > 0.0:
         step = math.floor(inputs.time / timestep + 0.5)
@@ -243,13 +259,13 @@ def observe(
     return signals.current + error, signals.reference_current
 
 
-_PAST_THE_CONTROLLER = ("max_voltage", "substeps", "current_bias", "current_noise")
-"""What of a controller counts where the agent commands the voltage."""
+_APPLIED_TO_VOLTAGE = ("max_voltage", "substeps", "current_bias", "current_noise")
+"""Fields of the controller that still apply if the agent commands the voltage."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DCMotorActuator(ActuatorModel):
-    """A motor and the current loop that drives it: what stands between a desired force and the force delivered."""
+    """Motor and current loop between the desired force and the delivered force."""
 
     family: ClassVar[str] = "current_loop"
     electrical_step: ClassVar = staticmethod(electrical_step)
@@ -270,16 +286,16 @@ class DCMotorActuator(ActuatorModel):
     controller: CurrentLoop = CurrentLoop()
     """The current loop and its sensor."""
     supply: Supply | None = part(Supply())
-    """What feeds the drive; None: `controller.max_voltage`, whatever the current."""
+    """Supply of the drive; None: `controller.max_voltage` at any current."""
 
     @property
     def arm_radius(self) -> float:
-        """The motor's arm [m]."""
+        """Arm [m] of the motor."""
         return self.motor.arm_radius
 
     @property
     def back_emf_damping(self) -> float:
-        """As `ActuatorModel.back_emf_damping`: kT*kE/R, seen from the load."""
+        """Damping kT*kE/R at the load, as in `ActuatorModel.back_emf_damping`."""
         motor = self.motor
         return (
             motor.torque_constant
@@ -294,45 +310,49 @@ class DCMotorActuator(ActuatorModel):
 
     @property
     def voltage_limit(self) -> float:
-        """The largest voltage [V] without a current."""
+        """Largest voltage [V] at zero current."""
         return min(
             self.controller.max_voltage, math.inf if self.supply is None else self.supply.voltage
         )
 
     @property
     def assumed(self) -> str:
-        """As `ActuatorModel.assumed`: the controller's default limit, where the supply has more."""
-        most, voltage = (
+        """Default voltage limit if the supply has more; see `ActuatorModel.assumed`."""
+        max_voltage, voltage = (
             self.controller.max_voltage,
             math.inf if self.supply is None else self.supply.voltage,
         )
-        if not (most == CurrentLoop.max_voltage and most < voltage < math.inf):
+        if not (max_voltage == CurrentLoop.max_voltage and max_voltage < voltage < math.inf):
             return ""
-        limit = f"controller.max_voltage = {most:g} V, which limits the supply of {voltage:g} V"
-        return f"assumed, for none is given: {limit}"
+        limit = (
+            f"controller.max_voltage = {max_voltage:g} V, which limits the supply of {voltage:g} V"
+        )
+        return f"assumed, because not specified: {limit}"
 
     def commands(self) -> Mapping[str, Command]:
-        """A reference `current` [A], or a `voltage` [V] past the controller: end to end."""
+        """Return the commands `current` [A] and, bypassing the controller, `voltage` [V]."""
         torque = self.motor.torque_constant
         fixed = dict.fromkeys(
             ("motor.torque_constant", "motor.arm_radius"), "it would change what an action means"
         )
-        passed = [
+        bypassed = [
             f"controller.{f.name}" for f in dataclasses.fields(CurrentLoop) if f.name != "substeps"
         ]
-        driven_fixed = fixed | dict.fromkeys(passed, "the command goes past the controller")
-        through = dataclasses.replace(
+        # With kff = 1 V/A and everything else 0, this controller passes the command on as a
+        # voltage.
+        voltage_fixed = fixed | dict.fromkeys(bypassed, "the command bypasses the controller")
+        feed_through = dataclasses.replace(
             CurrentLoop(kp=0.0, kff=1.0, bemf_compensation=False),
-            **{name: getattr(self.controller, name) for name in _PAST_THE_CONTROLLER},
+            **{name: getattr(self.controller, name) for name in _APPLIED_TO_VOLTAGE},
         )
-        driven = VoltageDriven(self.motor, through, self.supply)
+        driven = VoltageDriven(self.motor, feed_through, self.supply)
         return {
             "current": Command("A", self, torque, None, fixed),
-            "voltage": Command("V", driven, torque, self.voltage_limit, driven_fixed),
+            "voltage": Command("V", driven, torque, self.voltage_limit, voltage_fixed),
         }
 
     def check(self, timestep: float) -> None:
-        """Refuse a loop that is unstable at this step, or a supply under which a saturated motor's current is.
+        """Raise if the loop, or the current of a saturated motor at this supply, is unstable.
 
         Raises:
             ValueError: the spectral radius is 1 or more; the message has the number and a remedy
@@ -351,11 +371,11 @@ class DCMotorActuator(ActuatorModel):
         stability.check_stable(self, timestep)
 
     @classmethod
-    def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
-        """The spectral radius of the loop, or that of a saturated motor's current under its supply, if greater."""
-        columns = stability.columns(cls, numbers)
-        radii = stability.stability_radii(cls, numbers, timestep)
-        # under a saturated voltage the current is fed back through the supply
+    def instability(cls, parameter_values: np.ndarray, timestep: float) -> np.ndarray:
+        """Return the larger spectral radius of the loop and of a saturated motor at its supply."""
+        columns = stability.parameter_columns(cls, parameter_values)
+        radii = stability.stability_radii(cls, parameter_values, timestep)
+        # A saturated voltage drops with the current: the supply closes a loop of its own.
         pole = (
             (columns.resistance + columns.supply_resistance)
             * timestep
@@ -366,14 +386,17 @@ class DCMotorActuator(ActuatorModel):
         )
 
     def as_mapping(self) -> dict[str, Any]:
-        """The nested mapping that `actuator_from_mapping` reads, without a family: it is the one that goes unsaid."""
+        """Return the mapping that `actuator_from_mapping` reads, without the default family."""
         return dataclasses.asdict(self) if type(self) is DCMotorActuator else super().as_mapping()
 
 
 def _advance_driven(
     parameters: Any, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Signals]:
-    """`advance`, where the current asks for itself: an agent that commands the voltage desires whatever follows."""
+    """Run `advance`, and report the current as its own reference.
+
+    An agent that commands the voltage desires no particular current.
+    """
     state, torque, signals = advance(parameters, timestep, state, inputs)
     return (
         state,
@@ -385,20 +408,20 @@ def _advance_driven(
 def _observe_driven(
     parameters: Any, timestep: float, signals: Signals, inputs: Inputs
 ) -> tuple[float, float]:
-    """The measured current, which is its own reference too."""
+    """Return the measured current [A], which is also its own reference."""
     measured, _ = observe(parameters, timestep, signals, inputs)
     return measured, measured
 
 
 @dataclasses.dataclass(frozen=True)
 class VoltageDriven(DCMotorActuator):
-    """A motor under commanded voltage.
+    """Motor with a commanded voltage.
 
     With no feedback, a feed-forward gain of 1 V/A and no back-EMF compensation, the terminal
     voltage in volts is the reference current in amperes.
     """
 
     family: ClassVar[str] = ""
-    tracks: ClassVar[bool] = False
+    is_torque_controlled: ClassVar[bool] = False
     advance: ClassVar = staticmethod(_advance_driven)
     observe: ClassVar = staticmethod(_observe_driven)

@@ -1,10 +1,10 @@
-"""An off-the-shelf motor behind an off-the-shelf drive, family `drive`: gear, rotor, friction, a sampled PI loop.
+"""Geared motor with a digital current loop, family `drive`: gear, rotor, friction, sampled PI loop.
 
-Where the paper's `current_loop` takes one or a few Euler steps of a slow winding, a bench motor's
-winding has a time constant of 0.1 to 5 ms under a loop that samples at 10 to 40 kHz. The winding is
-exact here, the loop has a sample rate of its own, its integrator does not wind up, and what is
-delivered over a mechanical step is the *mean* torque of it: the current at the end of a step says
-little of what moved the load.
+The paper's `current_loop` takes one or a few Euler steps of a slow winding. The winding of a real
+motor has a time constant of 0.1 to 5 ms under a loop that samples at 10 to 40 kHz. This family
+solves the winding exactly and samples the loop at its own rate, with anti-windup. It delivers the
+*mean* torque over a mechanical step, because the current at the end of a step tells little about
+the torque that moved the load.
 """
 
 import dataclasses
@@ -21,12 +21,12 @@ from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, JointAdditions, UnstableError
 from codrl_mj.actuators.parameters import parameters_type
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
-from codrl_mj.actuators.shaft import Heat, Means, Shaft, Winding
+from codrl_mj.actuators.shaft import Shaft, StepAverages, TemperatureRises, Winding
 from codrl_mj.fields import part
 
 
 class State(NamedTuple):
-    """What the drive remembers."""
+    """State of the drive."""
 
     current: float
     """Motor current [A]."""
@@ -35,115 +35,135 @@ class State(NamedTuple):
     pending: float
     """Voltage [V] that a delayed loop applies in the next sample."""
     winding_rise: float
-    """How much warmer [K] the winding is than the housing."""
+    """Temperature difference [K] between winding and housing."""
     housing_rise: float
-    """How much warmer [K] the housing is than the surroundings."""
+    """Temperature difference [K] between housing and surroundings."""
     acceleration: float
-    """What the torque delivered in the last step did to the rotor's speed [rad/s^2]."""
+    """Acceleration [rad/s^2] of the rotor by the torque of the last step."""
     speed: float
-    """Speed [rad/s] of the rotor at its beginning."""
-    others: float
-    """Acceleration [rad/s^2] of the rotor by all but the motor, as it was taken to be."""
-    due: float
-    """When [s] the next step is to begin; 0 before the first."""
+    """Speed [rad/s] of the rotor at the beginning of the last step."""
+    external_acceleration: float
+    """Estimated acceleration [rad/s^2] of the rotor by everything but the motor in the last step.
+    """
+    expected_time: float
+    """Time [s] at which the next step should begin; 0 before the first step."""
 
 
 class Signals(NamedTuple):
-    """What can be seen of a step."""
+    """Signals after a step."""
 
     current: float
-    """Mean current [A] over the step: times kT, the torque of the motor."""
+    """Mean current [A] over the step; times kT it is the torque of the motor."""
     reference_current: float
-    """Current asked of the loop [A], within its limits."""
+    """Reference current [A] of the loop, within its limits."""
     voltage: float
     """Mean terminal voltage [V] over the step."""
     temperature: float
-    """Of the winding [degC], at the end of the step."""
+    """Temperature [degC] of the winding at the end of the step."""
     saturated: float
-    """1 where any of the three that follow is."""
+    """1 if any of the following three signals is 1."""
     voltage_saturated: float
-    """1 where the voltage was at the supply's limit in some sample."""
+    """1 if the voltage reached the supply's limit in at least one sample."""
     current_saturated: float
-    """1 where more than `max_current` was asked for."""
+    """1 if the command exceeded `max_current`."""
     temperature_saturated: float
-    """1 where more was asked for than takes the winding to `max_temperature`, and less than `max_current` was given."""
+    """1 if `max_temperature` limited the current to less than `max_current`."""
     electrical_power: float
     """Mean of voltage times current at the winding's terminals [W]."""
     copper_loss: float
-    """Mean heat [W] in the winding, by the square of the current within the samples."""
+    """Mean heat [W] in the winding, from the squared current within the samples."""
 
 
-def limited(parameters: Any, timestep: float, heat: Heat, resistance: float, asked: float) -> float:
-    """The current [A] that the loop is given: what is asked for, within `max_current` and what the winding bears."""
-    most = parameters.max_current
-    if parameters.max_temperature < math.inf and shaft.is_warming(parameters):
-        most = min(most, shaft.thermal_limit(parameters, timestep, heat, resistance))
-    return min(max(asked, -most), most)
+def limit_current(
+    parameters: Any, timestep: float, heat: TemperatureRises, resistance: float, current: float
+) -> float:
+    """Return the commanded current [A] within `max_current` and the thermal limit."""
+    limit = parameters.max_current
+    if parameters.max_temperature < math.inf and shaft.has_thermal_model(parameters):
+        limit = min(limit, shaft.thermal_limit(parameters, timestep, heat, resistance))
+    return min(max(current, -limit), limit)
 
 
-def begin(
+def begin_step(
     parameters: Any, timestep: float, state: Any, inputs: Inputs
-) -> tuple[Winding, Heat, Shaft]:
-    """Winding, temperatures and shaft at the beginning of a step, from a state that has the entries of `State`."""
-    inertia, others = shaft.inertia_of(parameters, inputs.inertia), 0.0
-    if state.due > 0.0 and abs(inputs.time - state.due) < 0.5 * timestep and inertia < math.inf:
-        others = shaft.others_after(
-            timestep, inputs.speed - state.speed, state.acceleration, state.others
+) -> tuple[Winding, TemperatureRises, Shaft]:
+    """Return winding, temperatures and shaft at the beginning of a step, from a drive's state."""
+    inertia, external_acceleration = shaft.inertia_of(parameters, inputs.inertia), 0.0
+    # The estimate needs the previous step. A step that begins at another time than expected follows
+    # a reset or a stage of Runge-Kutta.
+    if (
+        state.expected_time > 0.0
+        and abs(inputs.time - state.expected_time) < 0.5 * timestep
+        and inertia < math.inf
+    ):
+        external_acceleration = shaft.estimate_external_acceleration(
+            timestep, inputs.speed - state.speed, state.acceleration, state.external_acceleration
         )
-    moving = Shaft(inertia, others, inputs.speed)
+    rotor = Shaft(inertia, external_acceleration, inputs.speed)
     winding = Winding(state.current, state.integral, state.pending)
-    return winding, Heat(state.winding_rise, state.housing_rise), moving
+    return winding, TemperatureRises(state.winding_rise, state.housing_rise), rotor
 
 
-def end(
+def end_step(
     parameters: Any,
     timestep: float,
     time: float,
-    heat: Heat,
+    heat: TemperatureRises,
     resistance: float,
     winding: Winding,
-    moving: Shaft,
-    means: Means,
+    rotor: Shaft,
+    means: StepAverages,
 ) -> tuple[tuple[float, float, float, float, float, float, float, float, float], float]:
-    """The entries of `State` after a step, from temperatures and shaft at its beginning, and how warm the winding is.
+    """Return the entries of `State` after a step, and the temperature [degC] of the winding.
 
-    The mean current heats.
+    Temperatures and shaft are those at the beginning of the step. The mean current heats.
     """
-    if shaft.is_warming(parameters):
-        heat = shaft.heated(parameters, timestep, heat, resistance * means.current * means.current)
-    own = means.torque / moving.inertia
-    kept = winding.current, winding.integral, winding.pending, heat.winding, heat.housing
-    return (*kept, own, moving.speed, moving.others, time + timestep), shaft.temperature_of(
-        parameters, heat
-    )
+    if shaft.has_thermal_model(parameters):
+        heat = shaft.rises_after(
+            parameters, timestep, heat, resistance * means.current * means.current
+        )
+    acceleration = means.torque / rotor.inertia
+    remaining = winding.current, winding.integral, winding.pending, heat.winding, heat.housing
+    return (
+        *remaining,
+        acceleration,
+        rotor.speed,
+        rotor.external_acceleration,
+        time + timestep,
+    ), shaft.temperature_of(parameters, heat)
 
 
 def _advance(
     parameters: Any, timestep: float, state: State, inputs: Inputs, closed: bool
 ) -> tuple[State, float, Signals]:
-    """A step of a drive that a torque is asked of or, where the loop is not `closed`, a voltage: kT for a volt."""
-    asked = inputs.desired_torque / parameters.torque_constant
-    winding, heat, moving = begin(parameters, timestep, state, inputs)
+    """Advance a drive by one step, under a desired torque or, if not `closed`, a voltage.
+
+    A desired torque of kT stands for 1 V.
+    """
+    command = inputs.desired_torque / parameters.torque_constant
+    winding, heat, rotor = begin_step(parameters, timestep, state, inputs)
     resistance = shaft.resistance_at(parameters, shaft.temperature_of(parameters, heat))
-    reference = limited(parameters, timestep, heat, resistance, asked) if closed else asked
+    reference = (
+        limit_current(parameters, timestep, heat, resistance, command) if closed else command
+    )
     samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
-    winding, _, means = shaft.turn(
-        parameters, resistance, timestep, samples, winding, moving, closed, reference
+    winding, _, means = shaft.advance_motor(
+        parameters, resistance, timestep, samples, winding, rotor, closed, reference
     )
-    after, temperature = end(
-        parameters, timestep, inputs.time, heat, resistance, winding, moving, means
+    after, temperature = end_step(
+        parameters, timestep, inputs.time, heat, resistance, winding, rotor, means
     )
-    shown = reference if closed else means.current
-    less, warm = reference != asked, abs(reference) < parameters.max_current
+    reported = reference if closed else means.current
+    is_limited, is_thermal = reference != command, abs(reference) < parameters.max_current
     signals = Signals(
         means.current,
-        shown,
+        reported,
         means.voltage,
         temperature,
-        1.0 if means.saturated > 0.0 or less else 0.0,
+        1.0 if means.saturated > 0.0 or is_limited else 0.0,
         1.0 if means.saturated > 0.0 else 0.0,
-        1.0 if less and not warm else 0.0,
-        1.0 if less and warm else 0.0,
+        1.0 if is_limited and not is_thermal else 0.0,
+        1.0 if is_limited and is_thermal else 0.0,
         means.power,
         means.heat,
     )
@@ -153,7 +173,7 @@ def _advance(
 def advance(
     parameters: Any, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Signals]:
-    """Advance winding, loop and shaft by one mechanical step [s]; speed and inertia of the inputs are the rotor's."""
+    """Advance winding, loop and shaft by one mechanical step [s]; inputs are those of the rotor."""
     return _advance(parameters, timestep, state, inputs, True)
 
 
@@ -163,13 +183,13 @@ def observe(
     signals: Signals,
     inputs: Inputs,  # noqa: ARG001
 ) -> tuple[float, float]:
-    """The mean current [A] of the last step, which is what a drive reports, and its reference."""
+    """Return the mean current [A] of the last step, as drives report it, and the reference."""
     return signals.current, signals.reference_current
 
 
 @dataclasses.dataclass(frozen=True)
 class Drive(ActuatorModel):
-    """A motor with its gear, the drive's current loop and the supply: a bench motor.
+    """Motor with its gear, the drive's current loop and the supply.
 
     Raises:
         ValueError: a field is out of bounds.
@@ -189,7 +209,7 @@ class Drive(ActuatorModel):
     OBSERVED: ClassVar[tuple[str, ...]] = ("current", "reference_current")
     INERTIA: ClassVar[bool] = True
     CLOSED: ClassVar[bool] = True
-    """Whether a current loop is closed around the winding."""
+    """True if a current loop is closed around the winding."""
     advance: ClassVar[Callable[..., Any]] = staticmethod(advance)
     observe: ClassVar = staticmethod(observe)
 
@@ -198,23 +218,27 @@ class Drive(ActuatorModel):
     controller: SampledLoop = SampledLoop()
     """The current loop."""
     supply: Supply | None = part(Supply(voltage=24.0))
-    """What feeds the drive; None: 24 V without a resistance."""
+    """Supply of the drive; None: 24 V without a resistance."""
 
     @classmethod
-    def of(cls, numbers: Any) -> "Drive":
-        """A drive for a motor of `codrl_mj.catalogue.MotorNumbers`: its voltage (or 24 V), its peak current."""
-        most, voltage = numbers.max_current, numbers.voltage
-        loop = SampledLoop() if most is None else SampledLoop(max_current=most)
-        return cls(GearMotor.of(numbers), loop, None if voltage is None else Supply(voltage))
+    def from_motor_parameters(cls, parameters: Any) -> "Drive":
+        """Return a drive for a motor, with its nominal voltage (or 24 V) and its peak current."""
+        max_current, voltage = parameters.max_current, parameters.voltage
+        loop = SampledLoop() if max_current is None else SampledLoop(max_current=max_current)
+        return cls(
+            GearMotor.from_motor_parameters(parameters),
+            loop,
+            None if voltage is None else Supply(voltage),
+        )
 
     @property
     def arm_radius(self) -> float:
-        """Arm [m] between the rotor and the load: the gear is part of it."""
+        """Arm [m] between the rotor and the load, including the gear."""
         return self.motor.arm_radius / self.motor.gear_ratio
 
     @property
     def additions(self) -> JointAdditions:
-        """Rotor inertia and friction, seen from the load."""
+        """Rotor inertia and friction, as seen from the load."""
         arm, motor = self.arm_radius, self.motor
         return JointAdditions(
             motor.rotor_inertia / (arm * arm),
@@ -224,7 +248,7 @@ class Drive(ActuatorModel):
 
     @property
     def back_emf_damping(self) -> float:
-        """As `ActuatorModel.back_emf_damping`: kT*kE/R, seen from the load through a gear that loses some torque."""
+        """Damping kT*kE/R at the load through the gear, as in `ActuatorModel.back_emf_damping`."""
         motor = self.motor
         braking = motor.torque_constant * motor.back_emf_constant / motor.resistance
         return motor.gear_efficiency * braking / self.arm_radius**2
@@ -236,19 +260,19 @@ class Drive(ActuatorModel):
 
     @property
     def voltage_limit(self) -> float:
-        """The supply's voltage [V]."""
+        """Voltage [V] of the supply."""
         return 24.0 if self.supply is None else self.supply.voltage
 
     @property
-    def sag(self) -> float:
-        """The supply's resistance [ohm], by which its voltage sags under a current."""
+    def supply_resistance(self) -> float:
+        """Internal resistance [ohm] of the supply, by which its voltage drops under a current."""
         return 0.0 if self.supply is None else self.supply.resistance
 
     @property
     def assumed(self) -> str:
-        """As `ActuatorModel.assumed`: the supply, the largest current, the inertia of the rotor."""
+        """Default supply, current limit, inertia and constants; see `ActuatorModel.assumed`."""
         motor = self.motor
-        alike = 0.5 <= motor.back_emf_constant / motor.torque_constant <= 2.0
+        is_consistent = 0.5 <= motor.back_emf_constant / motor.torque_constant <= 2.0
         missing = {
             f"supply.voltage = {self.voltage_limit:g} V": (
                 self.supply is None or math.isinf(self.supply.voltage)
@@ -256,46 +280,56 @@ class Drive(ActuatorModel):
             "controller.max_current = inf": math.isinf(self.controller.max_current),
             "motor.rotor_inertia = 0": motor.rotor_inertia == 0.0,
         }
+        # In SI units the two constants are equal except for losses. If they differ a lot, one was
+        # probably left at the default of another motor.
         for name in (
             "torque_constant",
             "back_emf_constant",
-        ):  # of another motor: the two are equal but for losses
+        ):
             value = getattr(motor, name)
-            missing[f"motor.{name} = {value:g}, a default"] = not alike and value == getattr(
-                GearMotor, name
+            missing[f"motor.{name} = {value:g}, a default"] = (
+                not is_consistent and value == getattr(GearMotor, name)
             )
-        told = ", ".join(text for text, is_missing in missing.items() if is_missing)
-        return f"assumed, for none is given: {told}" if told else ""
+        assumptions = ", ".join(
+            assumption for assumption, is_missing in missing.items() if is_missing
+        )
+        return f"assumed, because not specified: {assumptions}" if assumptions else ""
 
     @classmethod
-    def from_numbers(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
-        """As `ActuatorModel.from_numbers`: the arm is that between rotor and load, the gear among the numbers."""
+    def from_parameter_values(cls, parameter_values: Any, arm_radius: float = 1.0) -> Any:
+        """Return the drive with these parameters.
+
+        The arm is that between rotor and load; the gear ratio is one of the parameters.
+        """
         family: Any = cls
-        return super().from_numbers(
-            numbers, arm_radius * parameters_type(family)(*numbers).gear_ratio
+        return super().from_parameter_values(
+            parameter_values, arm_radius * parameters_type(family)(*parameter_values).gear_ratio
         )
 
     def commands(self) -> Mapping[str, Command]:
-        """A reference `current` [A] within `max_current`, or the terminal `voltage` [V]."""
+        """Return the commands `current` [A], within `max_current`, and terminal `voltage` [V]."""
         limit, torque = self.controller.max_current, self.motor.torque_constant
         fixed = dict.fromkeys(
             ("motor.torque_constant", *ARM), "it would change what an action means"
         )
-        driven = VoltageDrive(self.motor, self.controller, self.supply)
-        past = ["motor.max_temperature", *(f"controller.{name}" for name in _PAST_THE_LOOP)]
+        voltage_drive = VoltageDrive(self.motor, self.controller, self.supply)
+        bypassed = [
+            "motor.max_temperature",
+            *(f"controller.{name}" for name in _BYPASSED_BY_VOLTAGE),
+        ]
         return {
             "current": Command("A", self, torque, limit if math.isfinite(limit) else None, fixed),
             "voltage": Command(
                 "V",
-                driven,
+                voltage_drive,
                 torque,
                 self.voltage_limit,
-                fixed | dict.fromkeys(past, "the command goes past the loop"),
+                fixed | dict.fromkeys(bypassed, "the command bypasses the loop"),
             ),
         }
 
     def check(self, timestep: float) -> None:
-        """Refuse a step without a whole number of samples, and a loop that is unstable.
+        """Raise if a step is not a whole number of samples, or if the loop is unstable.
 
         Raises:
             ValueError: with the numbers and a remedy.
@@ -308,7 +342,7 @@ class Drive(ActuatorModel):
                 f" {timestep:g} s holds {samples:g} samples, must be a whole number of them; the"
                 f" nearest rate is {nearest:.8g} Hz"
             )
-        radius = float(_radii(type(self), np.array([self.numbers]))[0])
+        radius = float(_radii(type(self), np.array([self.parameter_values]))[0])
         if not radius < 1.0:
             raise UnstableError(
                 f"actuator: the current loop is unstable: spectral radius {radius:.4g} over a"
@@ -318,15 +352,17 @@ class Drive(ActuatorModel):
             )
 
     def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
-        """Refuse a speed that the back-EMF of a saturated motor makes unstable; warn where it would be wrong.
+        """Raise if the back-EMF of a saturated motor makes the speed unstable, or warn.
 
         Raises:
             UnstableError: with the number and a remedy.
         """
-        rotor, told = self.motor.rotor_inertia, self.motor.load_inertia
-        held = held or math.isinf(told)
-        if 0.0 < told < math.inf:
-            inertia = rotor + told / self.motor.gear_ratio**2
+        rotor, load_inertia = self.motor.rotor_inertia, self.motor.load_inertia
+        held = held or math.isinf(load_inertia)
+        if 0.0 < load_inertia < math.inf:
+            inertia = rotor + load_inertia / self.motor.gear_ratio**2
+        # A speed that is held for a time h changes by the share h*kT*kE/(R*J) through the back-EMF:
+        # above 1 it oscillates, above 2 it grows.
         braking = self.motor.torque_constant * self.motor.back_emf_constant / self.motor.resistance
         samples = 1.0 if held else max(round(timestep * self.controller.sample_rate), 1)
         share = timestep / samples * braking / inertia
@@ -334,29 +370,29 @@ class Drive(ActuatorModel):
         if held:
             remedy = (
                 "shorten the step"
-                if told == 0.0
-                else "leave motor.load_inertia 0, so that the speed is followed"
+                if load_inertia == 0.0
+                else "leave motor.load_inertia 0, so that the speed within a step is predicted"
             )
         text = (
             f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes {share:.3g}"
-            f" of the rotor's speed in {timestep / samples:g} s over which that is held"
+            f" of the rotor's speed in {timestep / samples:g} s during which it is held"
         )
         if share >= 2.0:
             raise UnstableError(
-                f"{text}, must be < 2; {remedy}, give the rotor its inertia (it moves {inertia:.3g}"
-                " kg*m^2 in all), shorten the step, or pass allow_unstable=True to study it as"
-                " it is"
+                f"{text}, must be < 2; {remedy}, give the rotor its inertia (total:"
+                f" {inertia:.3g} kg*m^2), shorten the step, or pass allow_unstable=True to study it"
+                " as it is"
             )
         if share > 0.5:
             warnings.warn(
-                f"{text}: above 0.5 it is wrong, above 1 it rings; {remedy}", stacklevel=2
+                f"{text}: above 0.5 it is inaccurate, above 1 it oscillates; {remedy}", stacklevel=2
             )
         elif share * samples > 3.0:
             warnings.warn(
                 f"motor.rotor_inertia = {rotor:g}: a step of {timestep:g} s is"
                 f" {share * samples:.3g} times the time in which the back-EMF of a saturated motor"
                 " brakes its rotor. A free shaft is simulated well; at a stop, under friction or"
-                " beside other joints the torque comes about as many steps late: "
+                " with other joints the torque is delayed by about as many steps: "
                 + (
                     "give rotor_inertia, or shorten the step"
                     if rotor == 0.0
@@ -366,52 +402,54 @@ class Drive(ActuatorModel):
             )
 
     @classmethod
-    def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
-        """The spectral radius of the loop over a sample; infinite where a step holds no whole number of samples.
+    def instability(cls, parameter_values: np.ndarray, timestep: float) -> np.ndarray:
+        """Return the spectral radius of the loop over a sample; infinity for invalid combinations.
 
-        And where two fields are together what their class refuses.
+        A step that is not a whole number of samples is invalid, and fields that `GearMotor` or
+        `SampledLoop` reject together.
         """
-        columns = stability.columns(cls, numbers)
+        columns = stability.parameter_columns(cls, parameter_values)
         samples = timestep * columns.sample_rate
-        possible = (abs(samples - np.round(samples)) <= 1e-6 * samples) & (samples >= 0.5)
-        # what `GearMotor` and `SampledLoop` refuse of fields together
-        possible &= columns.max_temperature > columns.ambient_temperature
-        possible &= columns.bandwidth <= columns.sample_rate / (2.0 * math.pi)
-        possible &= np.isinf(columns.max_temperature) | (
+        valid = (abs(samples - np.round(samples)) <= 1e-6 * samples) & (samples >= 0.5)
+        # These are the combinations that `GearMotor` and `SampledLoop` reject.
+        valid &= columns.max_temperature > columns.ambient_temperature
+        valid &= columns.bandwidth <= columns.sample_rate / (2.0 * math.pi)
+        valid &= np.isinf(columns.max_temperature) | (
             columns.thermal_resistance_winding + columns.thermal_resistance_housing > 0.0
         )
-        possible &= (
-            1.0 + columns.resistance_coefficient * (columns.ambient_temperature - 25.0) > 0.0
-        )
-        return np.where(possible, _radii(cls, numbers), np.inf)
+        valid &= 1.0 + columns.resistance_coefficient * (columns.ambient_temperature - 25.0) > 0.0
+        return np.where(valid, _radii(cls, parameter_values), np.inf)
 
 
 ARM = ("motor.gear_ratio", "motor.arm_radius")
-"""Fields that change what a torque at the rotor is at the joint."""
-_PAST_THE_LOOP = ("bandwidth", "kp", "ki", "anti_windup", "bemf_compensation", "max_current")
-"""What of a loop does not count where the agent commands the voltage."""
+"""Fields that determine how a torque at the rotor acts on the joint."""
+_BYPASSED_BY_VOLTAGE = ("bandwidth", "kp", "ki", "anti_windup", "bemf_compensation", "max_current")
+"""Fields of the loop that have no effect if the agent commands the voltage."""
 
 
 def _advance_driven(
     parameters: Any, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Signals]:
-    """`advance` past the loop; the current asks for itself, as an agent that commands voltages desires what follows."""
+    """Run `advance` without the loop, and report the current as its own reference.
+
+    An agent that commands the voltage desires no particular current.
+    """
     return _advance(parameters, timestep, state, inputs, False)
 
 
 @dataclasses.dataclass(frozen=True)
 class VoltageDrive(Drive):
-    """A drive under commanded terminal voltage; a desired torque of kT stands for a volt."""
+    """Drive with a commanded terminal voltage; a desired torque of kT stands for 1 V."""
 
     family: ClassVar[str] = ""
-    tracks: ClassVar[bool] = False
+    is_torque_controlled: ClassVar[bool] = False
     CLOSED: ClassVar[bool] = False
     advance: ClassVar = staticmethod(_advance_driven)
 
 
-def _radii(cls: Any, numbers: np.ndarray) -> np.ndarray:
-    """Spectral radii over one sample, unsaturated and saturated, shape (m,)."""
-    columns = stability.columns(cls, numbers)
+def _radii(cls: Any, parameter_values: np.ndarray) -> np.ndarray:
+    """Return the spectral radii over one sample, unsaturated and saturated, shape (m,)."""
+    columns = stability.parameter_columns(cls, parameter_values)
     sample_time, resistance = 1.0 / columns.sample_rate, columns.resistance
     x = resistance * sample_time / columns.inductance
     decay = np.exp(-x)
@@ -425,20 +463,27 @@ def _radii(cls: Any, numbers: np.ndarray) -> np.ndarray:
     ki = np.where(designed, gains[1], columns.ki * sample_time)
     if not cls.CLOSED:
         kp, ki = 0.0 * kp, 0.0 * ki
-    effect = (1.0 - decay) / resistance  # of a volt, in a sample
-    nothing, one, late = np.zeros(len(numbers)), np.ones(len(numbers)), columns.delayed != 0.0
-    integrates = ki > 0.0  # else the integral is no part of the loop
-    voltage = -(kp + ki), np.where(integrates, one, 0.0), nothing  # of (current, integral, pending)
+    # Current [A] that 1 V adds within a sample.
+    current_per_volt = (1.0 - decay) / resistance
+    zero, ones, is_delayed = (
+        np.zeros(len(parameter_values)),
+        np.ones(len(parameter_values)),
+        columns.delayed != 0.0,
+    )
+    # Without an integral gain, the integral would only add an eigenvalue of 1.
+    has_integral = ki > 0.0
+    # Gains of the voltage for (current, integral, pending voltage).
+    voltage = -(kp + ki), np.where(has_integral, ones, 0.0), zero
     rows = [
         [
-            decay + np.where(late, 0.0, effect * voltage[0]),
-            np.where(late, 0.0, effect * voltage[1]),
-            late * effect,
+            decay + np.where(is_delayed, 0.0, current_per_volt * voltage[0]),
+            np.where(is_delayed, 0.0, current_per_volt * voltage[1]),
+            is_delayed * current_per_volt,
         ],
-        [-ki, np.where(integrates, one, 0.0), nothing],
-        [late * voltage[0], late * voltage[1], nothing],
+        [-ki, np.where(has_integral, ones, 0.0), zero],
+        [is_delayed * voltage[0], is_delayed * voltage[1], zero],
     ]
     matrices = np.array(rows).transpose(2, 0, 1)
     radii = np.abs(np.linalg.eigvals(matrices).astype(np.complex128)).max(axis=1)
-    # at its limit the voltage follows the current through the supply's resistance
-    return np.maximum(radii, np.abs(decay - effect * columns.supply_resistance))
+    # At its limit the voltage depends on the current through the supply's resistance.
+    return np.maximum(radii, np.abs(decay - current_per_volt * columns.supply_resistance))

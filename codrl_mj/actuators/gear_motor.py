@@ -1,4 +1,4 @@
-"""A motor with its gear: what a datasheet says of it, and what a bench adds."""
+"""Motor with its gear: the values of a datasheet, and those measured on a bench."""
 
 import dataclasses
 import math
@@ -11,7 +11,7 @@ from codrl_mj.fields import Checked, real
 
 @dataclasses.dataclass(frozen=True)
 class GearMotor(Checked):
-    """A DC motor, or a brushless one seen from its drive, with its gear: what a datasheet says.
+    """DC motor with a gear, or a brushless motor as seen by its drive, described by its datasheet.
 
     Brushless motors: terminal quantities, line to line, of the equivalent DC motor.
 
@@ -20,56 +20,66 @@ class GearMotor(Checked):
     """
 
     resistance: float = real(8.4, above=0.0, unit="ohm")
-    """Terminal resistance R [ohm], > 0. The defaults are the Quanser QUBE-Servo 2's motor."""
+    """Terminal resistance R [ohm], > 0. The defaults are those of the Quanser QUBE-Servo 2's motor.
+    """
     inductance: float = real(1.16e-3, above=0.0, unit="H")
     """Terminal inductance L [H], > 0."""
     torque_constant: float = real(0.042, above=0.0, unit="N*m/A")
     """Torque constant kT [N*m/A] at the rotor, > 0."""
-    back_emf_constant: float = real(0.042, least=0.0, unit="V*s/rad")
-    """Back-EMF constant kE [V*s/rad] at the rotor, >= 0; equal to kT in SI units but for losses."""
-    rotor_inertia: float = real(4.0e-6, least=0.0, unit="kg*m^2")
-    """Inertia J [kg*m^2] of the rotor, >= 0: the joint gets J*n^2."""
-    gear_ratio: float = real(1.0, above=0.0, unit="")
-    """Turns n of the rotor for a turn of the output shaft, > 0."""
-    gear_efficiency: float = real(1.0, above=0.0, most=1.0)
-    """Share of the torque that the gear passes on when it drives, in (0, 1]; driven, it brakes with
-    1/efficiency - 1 of the torque: friction that depends on the load, part of what is delivered
-    (`codrl_mj.actuators.shaft.friction`).
+    back_emf_constant: float = real(0.042, minimum=0.0, unit="V*s/rad")
+    """Back-EMF constant kE [V*s/rad] at the rotor, >= 0; equal to kT in SI units except for losses.
     """
-    coulomb_friction: float = real(0.0, least=0.0, unit="N*m")
-    """Coulomb friction [N*m] at the rotor, >= 0: the joint's `frictionloss`."""
-    viscous_friction: float = real(0.0, least=0.0, unit="N*m*s/rad")
-    """Viscous friction [N*m*s/rad] at the rotor, >= 0: the joint's `damping`."""
-    stribeck_friction: float = real(0.0, least=0.0, unit="N*m")
-    """What friction has at standstill [N*m] at the rotor over the Coulomb friction, >= 0; with the
-    speed w it falls as exp(-|w/`stribeck_speed`|^`stribeck_exponent`). Part of what is delivered
-    (`codrl_mj.actuators.shaft.friction`).
+    rotor_inertia: float = real(4.0e-6, minimum=0.0, unit="kg*m^2")
+    """Inertia J [kg*m^2] of the rotor, >= 0: it adds J*n^2 to the joint."""
+    gear_ratio: float = real(1.0, above=0.0, unit="")
+    """Gear ratio n, > 0: turns of the rotor per turn of the output shaft."""
+    gear_efficiency: float = real(1.0, above=0.0, maximum=1.0)
+    """Efficiency of the gear when the motor drives the load, in (0, 1]. When the load drives the
+    motor, the gear brakes with 1/efficiency - 1 of the torque. This load-dependent friction is part
+    of the delivered torque (`codrl_mj.actuators.shaft.friction`).
+    """
+    coulomb_friction: float = real(0.0, minimum=0.0, unit="N*m")
+    """Coulomb friction [N*m] at the rotor, >= 0: `frictionloss` of the joint."""
+    viscous_friction: float = real(0.0, minimum=0.0, unit="N*m*s/rad")
+    """Viscous friction [N*m*s/rad] at the rotor, >= 0: `damping` of the joint."""
+    stribeck_friction: float = real(0.0, minimum=0.0, unit="N*m")
+    """Additional friction [N*m] at the rotor at standstill, on top of the Coulomb friction, >= 0.
+    It decreases with the speed w as exp(-|w/`stribeck_speed`|^`stribeck_exponent`), and is part of
+    the delivered torque (`codrl_mj.actuators.shaft.friction`).
     """
     stribeck_speed: float = real(1.0, above=0.0, unit="rad/s")
-    """Speed [rad/s] of the rotor at which 1/e of it is left, > 0."""
-    stribeck_exponent: float = real(2.0, above=0.0, most=10.0, unit="")
-    """How abruptly it falls, > 0 and <= 10: 2 is the usual, fits to servos give 1.3 and more."""
-    load_inertia: float = real(0.0, least=0.0, unit="kg*m^2", infinite=True)
-    """Inertia [kg*m^2] of what the output shaft moves, >= 0, by which its speed changes within a
-    step; 0: what it is in the model at each moment; `inf`: the speed is held over a step. Nothing
-    is added to the model by it.
+    """Speed [rad/s] of the rotor at which 1/e of the Stribeck friction remains, > 0."""
+    stribeck_exponent: float = real(2.0, above=0.0, maximum=10.0, unit="")
+    """Exponent of the decrease, > 0 and <= 10: usually 2; fits to servos give 1.3 and more."""
+    load_inertia: float = real(0.0, minimum=0.0, unit="kg*m^2", infinite=True)
+    """Inertia [kg*m^2] that the output shaft moves, >= 0, from which the speed within a step is
+    predicted. 0: the inertia in the model at each moment; `inf`: the speed is held over a step. It
+    is not added to the model.
     """
-    thermal_resistance_winding: float = real(0.0, least=0.0, unit="K/W")
-    """Thermal resistance [K/W] from the winding to the housing, >= 0; 0: the winding is as warm as the housing."""
+    thermal_resistance_winding: float = real(0.0, minimum=0.0, unit="K/W")
+    """Thermal resistance [K/W] from winding to housing, >= 0; 0: both have the same temperature."""
     thermal_time_constant_winding: float = real(10.0, above=0.0, unit="s")
     """Time constant [s] of the winding's temperature, > 0."""
-    thermal_resistance_housing: float = real(0.0, least=0.0, unit="K/W")
-    """Thermal resistance [K/W] from the housing to the surroundings, >= 0; 0: it stays as cold as they are."""
+    thermal_resistance_housing: float = real(0.0, minimum=0.0, unit="K/W")
+    """Thermal resistance [K/W] from the housing to the surroundings, >= 0; 0: the housing stays at
+    ambient temperature.
+    """
     thermal_time_constant_housing: float = real(100.0, above=0.0, unit="s")
     """Time constant [s] of the housing's temperature, > 0."""
     ambient_temperature: float = real(25.0, above=-273.15, unit="degC")
-    """Temperature [degC] of the surroundings, and of the winding at the start of an episode."""
+    """Ambient temperature [degC], and temperature of the winding at the start of an episode."""
     max_temperature: float = real(math.inf, above=-273.15, unit="degC", infinite=True)
-    """Temperature [degC] of the winding that the drive keeps by asking for less current, above ambient; `inf`: none."""
-    resistance_coefficient: float = real(0.00393, least=0.0, unit="1/K")
-    """Growth [1/K] of the resistance with the winding's temperature, from 25 degC on, >= 0. The default is copper's."""
+    """Largest temperature [degC] of the winding, above ambient; the drive limits its current to
+    keep it. `inf`: no limit.
+    """
+    resistance_coefficient: float = real(0.00393, minimum=0.0, unit="1/K")
+    """Temperature coefficient [1/K] of the resistance, relative to 25 degC, >= 0. The default is
+    that of copper.
+    """
     arm_radius: float = real(1.0, above=0.0, unit="m")
-    """Radius [m] of the wheel, drum or pinion on the output shaft that moves a slide, > 0; on a hinge 1."""
+    """Radius [m] of the wheel, drum or pinion on the output shaft that moves a slide, > 0; 1 on a
+    hinge.
+    """
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -77,8 +87,8 @@ class GearMotor(Checked):
         if not self.max_temperature > self.ambient_temperature:
             raise ValueError(
                 f"GearMotor.max_temperature = {self.max_temperature:g}: must be above"
-                f" ambient_temperature = {self.ambient_temperature:g} degC, or no current at all"
-                " would be asked for"
+                f" ambient_temperature = {self.ambient_temperature:g} degC, or the drive would"
+                "never request a current"
             )
         if (
             self.max_temperature < math.inf
@@ -86,8 +96,8 @@ class GearMotor(Checked):
         ):
             raise ValueError(
                 f"GearMotor.max_temperature = {self.max_temperature:g}: needs"
-                " thermal_resistance_winding or thermal_resistance_housing, without which nothing"
-                " warms"
+                " thermal_resistance_winding or thermal_resistance_housing; without both the motor"
+                " does not warm up"
             )
         if not 1.0 + self.resistance_coefficient * (self.ambient_temperature - 25.0) > 0.0:
             raise ValueError(
@@ -98,57 +108,62 @@ class GearMotor(Checked):
 
     @classmethod
     def from_datasheet(cls, **printed: Any) -> "GearMotor":
-        """A motor from what its datasheet prints, each value as text with its unit.
+        """Return a motor from the values of its datasheet, each a text with its unit.
 
-            >>> GearMotor.from_datasheet(resistance="0.464 ohm", inductance="0.322 mH", torque_constant="25.1 mN*m/A",
+            >>> GearMotor.from_datasheet(resistance="0.464 ohm", inductance="0.322 mH",
+            ...                          torque_constant="25.1 mN*m/A",
             ...                          rotor_inertia="135 g*cm^2").torque_constant
             0.0251
 
         Args:
-            printed: as for `codrl_mj.catalogue.from_datasheet`, which also says how each number
-                came about.
+            printed: as for `codrl_mj.catalogue.from_datasheet`, which also explains each number.
 
         Raises:
-            ValueError: the datasheet does not suffice, or contradicts itself; the message has
+            ValueError: the datasheet is not sufficient or contradicts itself; the message has
                 values and remedy.
         """
         from codrl_mj.catalogue import from_datasheet
 
-        return cls.of(from_datasheet(**printed))
+        return cls.from_motor_parameters(from_datasheet(**printed))
 
     @classmethod
-    def of(cls, numbers: Any) -> "GearMotor":
-        """A motor of `codrl_mj.catalogue.MotorNumbers`; what they do not know is left at 0, an efficiency at 1."""
-        known = {
-            field.name: getattr(numbers, field.name, None) for field in dataclasses.fields(cls)
+    def from_motor_parameters(cls, parameters: Any) -> "GearMotor":
+        """Return a motor with `codrl_mj.catalogue.MotorParameters`.
+
+        Unknown values become 0, an unknown efficiency 1.
+        """
+        values = {
+            field.name: getattr(parameters, field.name, None) for field in dataclasses.fields(cls)
         }
-        known |= {name: 0.0 for name in _UNKNOWN if known[name] is None}
-        whole = getattr(numbers, "thermal_resistance", None)
-        if known["thermal_resistance_winding"] is None and whole is not None:
-            known["thermal_resistance_winding"] = whole - (
-                known["thermal_resistance_housing"] or 0.0
+        values |= {name: 0.0 for name in _UNKNOWN if values[name] is None}
+        total_resistance = getattr(parameters, "thermal_resistance", None)
+        if values["thermal_resistance_winding"] is None and total_resistance is not None:
+            values["thermal_resistance_winding"] = total_resistance - (
+                values["thermal_resistance_housing"] or 0.0
             )
-        if known["thermal_resistance_winding"] is None:
-            known["max_temperature"] = None
-        return cls(**{name: value for name, value in known.items() if value is not None})
+        # Without any thermal resistance the winding never warms, and the constructor would reject a
+        # temperature limit.
+        if values["thermal_resistance_winding"] is None:
+            values["max_temperature"] = None
+        return cls(**{name: value for name, value in values.items() if value is not None})
 
     def stribeck(self, speed: Any) -> Any:
-        """Stribeck friction [N*m] at the rotor at its speed [rad/s], any shape."""
+        """Return the Stribeck friction [N*m] at the rotor for a speed [rad/s] of any shape."""
         return self.stribeck_friction * np.exp(
             -(np.abs(speed / self.stribeck_speed) ** self.stribeck_exponent)
         )
 
     @property
     def electrical_time_constant(self) -> float:
-        """L/R [s]."""
+        """Electrical time constant L/R [s]."""
         return self.inductance / self.resistance
 
     @property
     def mechanical_time_constant(self) -> float:
-        """R*J/(kT*kE) [s] of the motor alone, without its gear and load; infinite without a back-EMF."""
+        """Time constant R*J/(kT*kE) [s] of the motor alone; infinite without a back-EMF."""
         product = self.torque_constant * self.back_emf_constant
         return self.resistance * self.rotor_inertia / product if product > 0.0 else math.inf
 
 
 _UNKNOWN = ("rotor_inertia", "coulomb_friction", "viscous_friction")
-"""What a datasheet may leave open, and is 0 then."""
+"""Fields that a datasheet may omit and that then are 0."""

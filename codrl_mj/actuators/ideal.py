@@ -1,4 +1,4 @@
-"""The ideal actuator, family `ideal`: what is asked for is delivered."""
+"""Ideal actuator, family `ideal`: it delivers the desired torque."""
 
 import dataclasses
 from typing import Any, ClassVar, NamedTuple
@@ -7,7 +7,7 @@ from codrl_mj.actuators.model import ActuatorModel, Inputs, Nothing
 
 
 class Signals(NamedTuple):
-    """The current loop's signals, all 0, so that an environment's `info` has the same keys with a motor and without."""
+    """Signals of the current loop, all 0, so that `info` has the same keys without a motor."""
 
     current: float
     reference_current: float
@@ -27,7 +27,7 @@ def advance(
 
 @dataclasses.dataclass(frozen=True)
 class Ideal(ActuatorModel):
-    """Force = desired force: no motor at all."""
+    """Actuator without a motor: force = desired force."""
 
     family: ClassVar[str] = "ideal"
     Signals: ClassVar[type] = Signals
@@ -35,4 +35,4 @@ class Ideal(ActuatorModel):
 
 
 IDEAL = Ideal()
-"""The ideal actuator."""
+"""The shared ideal actuator."""

@@ -1,4 +1,4 @@
-"""A first-order lag, family `lag`: the simplest actuator that is late."""
+"""First-order lag, family `lag`: the simplest actuator with a delayed response."""
 
 import dataclasses
 import math
@@ -11,11 +11,11 @@ from codrl_mj.actuators.model import ActuatorModel, Inputs, Nothing
 from codrl_mj.fields import real
 
 HISTORY = 8
-"""Commands that are remembered: the longest delay in mechanical steps."""
+"""Number of past commands in the state: the longest delay in mechanical steps."""
 
 
 class State(NamedTuple):
-    """The delivered torque [N*m], and the commands on their way, the newest first."""
+    """Delivered torque [N*m] and the commands of the last steps, the newest first."""
 
     torque: float
     c1: float
@@ -31,11 +31,11 @@ class State(NamedTuple):
 def advance(
     parameters: Any, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Nothing]:
-    """Tau' = (gain*u(t - delay) - tau)/T, exactly, with u held over a step: tau -> g*u + (tau - g*u)*exp(-dt/T).
+    """Advance tau' = (gain*u(t - delay) - tau)/T exactly, with u held over a step.
 
-    The torque is that at the end of the step, as the current loop's is. A delay that is no whole
-    number of steps mixes the two neighbouring commands in proportion, which is what held commands
-    come to on average over a step.
+    The update is tau -> g*u + (tau - g*u)*exp(-dt/T). The returned torque is that at the end of the
+    step, as with the current loop. If the delay is not a whole number of steps, the two adjacent
+    commands are weighted in proportion, which equals the average of the held commands over a step.
     """
     commands = (
         inputs.desired_torque,
@@ -48,17 +48,18 @@ def advance(
         state.c7,
         state.c8,
     )
+    # A delay that misses a whole number of steps by rounding only must not mix in the next command.
     steps = parameters.delay / timestep
-    whole = min(int(steps + 1e-9), 8)
-    fraction = min(max(steps - whole, 0.0), 1.0) if steps - whole > 1e-9 else 0.0
-    arrived = commands[whole]
+    whole_steps = min(int(steps + 1e-9), 8)
+    fraction = min(max(steps - whole_steps, 0.0), 1.0) if steps - whole_steps > 1e-9 else 0.0
+    target = commands[whole_steps]
     if fraction > 0.0:
-        arrived = arrived + fraction * (commands[min(whole + 1, 8)] - arrived)
-    arrived = parameters.gain * arrived
+        target = target + fraction * (commands[min(whole_steps + 1, 8)] - target)
+    target = parameters.gain * target
     decay = (
         math.exp(-timestep / parameters.time_constant) if parameters.time_constant > 0.0 else 0.0
     )
-    torque = arrived + (state.torque - arrived) * decay
+    torque = target + (state.torque - target) * decay
     after = State(
         torque,
         inputs.desired_torque,
@@ -75,9 +76,9 @@ def advance(
 
 @dataclasses.dataclass(frozen=True)
 class Lag(ActuatorModel):
-    """The delivered torque follows the desired one with a time constant, and, if there is one, a delay.
+    """First-order lag with an optional delay: the torque follows the command with a time constant.
 
-    What servo drives are modelled by where nothing is known of them but their step response.
+    It is the usual model of a servo drive of which only the step response is known.
 
     Raises:
         ValueError: a field is out of bounds.
@@ -87,20 +88,23 @@ class Lag(ActuatorModel):
     State: ClassVar[type] = State
     advance: ClassVar = staticmethod(advance)
 
-    time_constant: float = real(0.05, least=0.0, unit="s")
-    """Time constant T [s], >= 0: 63 % of a step is delivered after it. 0: nothing but the delay."""
-    delay: float = real(0.0, least=0.0, unit="s")
+    time_constant: float = real(0.05, minimum=0.0, unit="s")
+    """Time constant T [s], >= 0, after which 63 % of a step is delivered. 0: delay only."""
+    delay: float = real(0.0, minimum=0.0, unit="s")
     """Delay of the command [s], >= 0, at most eight mechanical steps."""
     gain: float = real(1.0, above=0.0)
-    """What of the desired torque is delivered in the end, > 0: 0.9 for a torque constant that is 10 % too small."""
+    """Steady-state ratio of delivered to desired torque, > 0: 0.9 for a torque constant that is 10
+    % too small.
+    """
 
     def check(self, timestep: float) -> None:
-        """Refuse a delay longer than what is remembered, and warn of a time constant that looks like one in ms.
+        """Raise if the delay exceeds the history; warn if the time constant seems to be in ms.
 
         Raises:
             ValueError: the delay is more than `HISTORY` steps.
         """
-        # Mountain Car decides once a second, and the studies let it lag by up to four of its steps.
+        # The limit is so high because Mountain Car decides once a second, and the studies use lags
+        # of up to four of its steps.
         if self.time_constant > 4.0:
             warnings.warn(
                 f"Lag.time_constant = {self.time_constant:g}: 63 % of a step is delivered after"
@@ -111,11 +115,11 @@ class Lag(ActuatorModel):
         if self.delay > HISTORY * timestep * (1 + 1e-9):
             raise ValueError(
                 f"Lag.delay = {self.delay:g}: must be <= {HISTORY * timestep:g} s, {HISTORY} steps"
-                f" of {timestep:g} s. Longer delays are the environment's:"
+                f" of {timestep:g} s. Longer delays belong to the environment:"
                 " disturbances={'command_delay': ...}"
             )
 
     @classmethod
-    def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
-        """Infinite where `check` refuses; a lag itself is always stable."""
-        return np.where(numbers[:, 1] > HISTORY * timestep * (1 + 1e-9), np.inf, 0.0)
+    def instability(cls, parameter_values: np.ndarray, timestep: float) -> np.ndarray:
+        """Return infinity where `check` raises; a lag is always stable."""
+        return np.where(parameter_values[:, 1] > HISTORY * timestep * (1 + 1e-9), np.inf, 0.0)

@@ -1,8 +1,9 @@
-"""What an actuator is to the rest of the package: a frozen dataclass of numbers, and one pure function.
+"""Base class of actuators: a frozen dataclass of numbers with one pure function, `advance`.
 
-A *family* of actuators is a subclass of `ActuatorModel`, in one file. What it says here is all that
-is known of it elsewhere: the doors into MuJoCo, the analytic physics, configuration files, the
-command line, randomisation, `info`, films and evaluations read it. docs/actuators.md builds one.
+A *family* of actuators is a subclass of `ActuatorModel`, in one file. Everything else in the
+package reads the family's class: the two MuJoCo backends, the analytic physics, configuration
+files, the command line, randomization, `info`, films and evaluations. docs/actuators.md builds an
+example.
 """
 
 import dataclasses
@@ -29,49 +30,50 @@ from codrl_mj.user_code import Form, call, check_form, source_location
 
 
 class Inputs(NamedTuple):
-    """What an actuator is told of the step that it drives; all of it is held over the step."""
+    """Inputs of an actuator in one mechanical step, held constant over the step."""
 
     desired_torque: float
-    """Torque asked for at the shaft [N*m], or force [N]."""
+    """Desired torque at the shaft [N*m], or force [N]."""
     position: float
     """Position of the shaft at the beginning of the step [rad] or [m]."""
     speed: float
-    """Its speed there [rad/s] or [m/s]."""
+    """Speed of the shaft at the beginning of the step [rad/s] or [m/s]."""
     time: float
     """Time since the start of the episode [s], at the beginning of the step."""
     noise_key: float
     """Key of the episode's random numbers, a whole number: see `codrl_mj.actuators.noise`."""
     inertia: float = math.inf
-    """Inertia at the shaft [kg*m^2], or mass [kg], of all that the model has it move, by the state
-    at the beginning of the step; `inf` for families that do not ask for it, and where nobody knows.
+    """Total inertia at the shaft [kg*m^2], or mass [kg], of everything that the actuator moves in
+    the model, for the state at the beginning of the step; `inf` for families without `INERTIA` and
+    where it is unknown.
     """
 
 
 class UnstableError(ValueError):
-    """An actuator that is not stable at a step; `allow_unstable=True` simulates it all the same."""
+    """An actuator is unstable at the given time step; `allow_unstable=True` simulates it anyway."""
 
 
 class Nothing(NamedTuple):
-    """No states, or no signals."""
+    """Empty named tuple, for families without states or without signals."""
 
 
 class Command(NamedTuple):
-    """What an agent's action can stand for other than a force."""
+    """Alternative meaning of an agent's action, for example a current or a voltage."""
 
     unit: str
-    """Its unit, for messages."""
+    """Unit of the command, for messages."""
     actuator: "ActuatorModel"
-    """What is simulated: the actuator with whatever the command goes past left out."""
+    """Simulated actuator: a copy without the control loops that the command bypasses."""
     torque_per_unit: float
-    """Torque [N*m] at the shaft that stands for a command of one."""
+    """Torque [N*m] at the shaft that corresponds to a command of one unit."""
     limit: float | None
-    """The largest command; None: that of the task's largest force."""
+    """Largest command; None: the command of the task's largest force."""
     fixed: Mapping[str, str]
-    """Fields that cannot be drawn -> why."""
+    """Fields that must not be randomized, with the reason for each."""
 
 
 class JointAdditions(NamedTuple):
-    """What an actuator adds to the joint that it drives."""
+    """Quantities that an actuator adds to the joint that it drives."""
 
     armature: float = 0.0
     """Inertia [kg*m^2], or mass [kg]."""
@@ -81,56 +83,66 @@ class JointAdditions(NamedTuple):
     """Coulomb friction [N*m], or [N]."""
 
 
+# The precise type would be `type[ActuatorModel]`, but mypy treats that as unhashable, and families
+# are arguments of cached functions.
 Family = Any
-"""A subclass of `ActuatorModel`: `type[ActuatorModel]`, which mypy takes for unhashable."""
+"""A subclass of `ActuatorModel`."""
 
 
 FAMILIES: dict[str, Any] = {}
-"""Our families by name, as they are defined; anybody else's is found as `module:Class`."""
+"""Built-in families by name. Custom families are referred to as `module:Class`."""
 BUILT_IN: list[Any] = []
-"""They, and what their commands leave of them."""
+"""Built-in families, including the nameless ones that their commands simulate."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ActuatorModel(fields.Checked):
-    """Base of every family of actuators: a frozen dataclass whose fields are made with `codrl_mj.fields`.
+    """Base class of all actuator families.
 
-    A family has a name, says its states and signals as `NamedTuple`s of floats, and defines
-    `advance`. The other methods have defaults that suit an actuator without a gear, without
-    electrics, and stable at any step.
+    Fields are created with the functions of `codrl_mj.fields`. A family has a name, declares its
+    states and signals as `NamedTuple`s of floats, and defines `advance`. The defaults of all other
+    methods suit an actuator without a gear and without electrics that is stable at any step.
 
     Raises:
         ValueError: a field is out of bounds.
     """
 
     family: ClassVar[str] = ""
-    """The family's name in mappings, files and on the command line; `module:Class` will always do as well."""
+    """Name of the family in mappings, files and on the command line. Optional: `module:Class` works
+    without it.
+    """
     State: ClassVar[type] = Nothing
-    """What it remembers: a `NamedTuple` of floats, all 0 at the start of an episode."""
+    """State of the actuator: a `NamedTuple` of floats, all 0 at the start of an episode."""
     Signals: ClassVar[type] = Nothing
-    """What can be seen of it after a step: a `NamedTuple` of floats. A signal called `saturated` is
-    1 where the actuator is at its limit; `voltage_saturated`, `current_saturated` and
-    `temperature_saturated` may say at which. Signals called `current` [A] and `voltage` [V] make
-    the electrical measures of an evaluation.
+    """Signals after a step: a `NamedTuple` of floats. A signal named `saturated` is 1 while the
+    actuator is at a limit; `voltage_saturated`, `current_saturated` and `temperature_saturated`
+    tell which limit. Evaluations compute their electrical measures from the signals `current` [A]
+    and `voltage` [V].
     """
     SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {}
     """Units of the signals, for tables and figures."""
     OBSERVED: ClassVar[tuple[str, ...]] = ()
-    """Names of what `observe` returns: what `observe_actuator=True` appends to an observation."""
+    """Names of the values that `observe` returns and `observe_actuator=True` appends to
+    observations.
+    """
     RANDOM: ClassVar[tuple[str, ...]] = ()
-    """Dotted paths of the fields that need the episode's key of random numbers where they are not 0."""
-    tracks: ClassVar[bool] = True
-    """Whether a torque is asked for at all; otherwise what is delivered counts as desired."""
+    """Dotted paths of the fields that need the episode's random key if they are not 0."""
+    is_torque_controlled: ClassVar[bool] = True
+    """True if the command is a torque. If False, `desired_force` equals the delivered force."""
     INERTIA: ClassVar[bool] = False
-    """Whether it is told the inertia at its shaft, which takes the engine some time to find."""
+    """True if `advance` needs the inertia at the shaft. The engine takes some time to compute it.
+    """
     MOTION: ClassVar[bool] = False
-    """Whether what is asked of it is a position or a speed of the shaft, in [rad] or [rad/s], in place of a torque."""
+    """True if the command is a position [rad] or a speed [rad/s] of the shaft instead of a torque.
+    """
 
-    def __init_subclass__(cls, **named: Any) -> None:
-        """Know a family of ours by its name, once; anybody else's is found as `module:Class`."""
-        super().__init_subclass__(**named)
-        if cls.__module__.startswith("codrl_mj.actuators.") and reference(cls) not in map(
-            reference, BUILT_IN
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Register a built-in family by its name; custom families are found as `module:Class`."""
+        super().__init_subclass__(**kwargs)
+        # Validation simulates edited copies of these modules. Their classes have the same import
+        # path, and must not replace the originals.
+        if cls.__module__.startswith("codrl_mj.actuators.") and import_path(cls) not in map(
+            import_path, BUILT_IN
         ):
             BUILT_IN.append(cls)
             if name := vars(cls).get("family"):
@@ -142,11 +154,11 @@ class ActuatorModel(fields.Checked):
         family: Any = type(self)
         kinds = fields.declared_parts(family)
         for field in dataclasses.fields(self) if kinds else ():
-            given = getattr(self, field.name)
-            if given is not field.default and not isinstance(given, kinds.get(field.name, object)):
+            value = getattr(self, field.name)
+            if value is not field.default and not isinstance(value, kinds.get(field.name, object)):
                 kind = fields.parts(family)[field.name].__name__
                 raise ValueError(
-                    f"{family.__name__}.{field.name} = {given!r}: must be a {kind}; to build one"
+                    f"{family.__name__}.{field.name} = {value!r}: must be a {kind}; to build one"
                     f" from nested mappings use {family.__name__}.from_mapping"
                 )
 
@@ -154,13 +166,15 @@ class ActuatorModel(fields.Checked):
     def advance(
         parameters: Any, timestep: float, state: Any, inputs: Inputs
     ) -> tuple[Any, float, Any]:
-        """Advance by one mechanical step. A pure function, in plain Python that numba compiles as it stands.
+        """Advance the actuator by one mechanical step.
+
+        The function must be pure and written in plain Python that numba can compile unchanged.
 
         Args:
-            parameters: a named tuple of floats: the fields by their names, those of parts too.
+            parameters: named tuple of floats: all fields by name, including those of nested parts.
             timestep: mechanical step [s].
-            state: a `State`, as the step before left it.
-            inputs: what is held over the step.
+            state: `State` after the previous step.
+            inputs: inputs that are held over the step.
 
         Returns:
             The new `State`, the torque delivered at the shaft [N*m] over the step, and `Signals`.
@@ -171,97 +185,98 @@ class ActuatorModel(fields.Checked):
     def observe(
         parameters: Any, timestep: float, signals: Any, inputs: Inputs
     ) -> tuple[float, ...]:
-        """What a sensor says of the signals at the time of `inputs`, entries as in `OBSERVED`; compiled as `advance`.
+        """Return sensor readings of the signals, entries as in `OBSERVED`; compiled like `advance`.
 
         Args:
             parameters: as for `advance`.
             timestep: mechanical step [s].
-            signals: of the last step; all 0 at the start of an episode.
-            inputs: of the present moment; only time and key are set.
+            signals: signals of the last step; all 0 at the start of an episode.
+            inputs: inputs at present; only time and key are set.
         """
         raise NotImplementedError
 
     @property
     def arm_radius(self) -> float:
-        """Arm [m] between shaft and load: torque = arm*force, speed of the shaft = speed/arm; 1/gear on a hinge."""
+        """Arm [m] between shaft and load: torque = arm*force; on a hinge it is 1/gear."""
         return 1.0
 
     @property
     def additions(self) -> JointAdditions:
-        """What it adds to its joint."""
+        """Inertia and friction that the actuator adds to its joint."""
         return JointAdditions()
 
     @property
     def back_emf_damping(self) -> float:
-        """Damping [N*m*s/rad] at the joint that its back-EMF amounts to: the slope of its torque-speed line."""
+        """Damping [N*m*s/rad] at the joint by the back-EMF: slope of the torque-speed line."""
         return 0.0
 
     @property
     def random(self) -> bool:
-        """Whether an episode needs a key for its random numbers."""
+        """True if an episode needs a key for random numbers."""
         return any(value_at(self, path) != 0.0 for path in self.RANDOM)
 
     @property
     def winding(self) -> tuple[float, float] | None:
-        """Resistance [ohm] and inductance [H] that its `current` flows through; None where there is none."""
+        """Resistance [ohm] and inductance [H] of the winding; None if there is none."""
         return None
 
     @property
     def voltage_limit(self) -> float | None:
-        """The largest voltage [V], to be drawn in figures of the signal `voltage`."""
+        """Largest voltage [V], drawn in figures of the signal `voltage`; None if there is none."""
         return None
 
     @property
     def assumed(self) -> str:
-        """A sentence on what is taken for numbers that nobody gave, for whoever uses it; empty where all are given."""
+        """Sentence that lists unspecified values and their defaults; empty if there are none."""
         return ""
 
     def commands(self) -> Mapping[str, Command]:
-        """What an agent can command besides the force, by name.
+        """Return the commands available to an agent besides the force, by name.
 
         Raises:
-            ValueError: when a command is read that the fields do not allow; the message names the
-                field.
+            ValueError: the fields do not allow a command that is read; the message names the field.
         """
         return {}
 
     def check(self, timestep: float) -> None:
-        """Refuse what cannot be simulated at a mechanical step [s].
+        """Raise if the actuator cannot be simulated at a mechanical step [s].
 
         Raises:
-            UnstableError: it is unstable there; the reason, with its number, and a remedy.
-            ValueError: it cannot be simulated at all, likewise.
+            UnstableError: the actuator is unstable; the message has the number and a remedy.
+            ValueError: the actuator cannot be simulated at all; the message likewise.
         """
 
     def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
-        """Refuse what cannot be simulated on a shaft that moves so much; called where `closes_loops`.
+        """Raise if the actuator cannot be simulated with this inertia; called if `closes_loops`.
 
         Args:
             timestep: mechanical step [s].
-            inertia: at the shaft [kg*m^2], or mass [kg], the rotor's own included, in the model's
-                initial position; its share of it where several drive the same joint.
-            held: whether it will not be told the inertia, or not be alone in changing the speed.
+            inertia: total inertia at the shaft [kg*m^2], or mass [kg], including the rotor's, in
+                the initial position of the model; this actuator's share if several drive the same
+                joint.
+            held: True if the inertia is not passed to `advance`, or if other things also change the
+                speed.
 
         Raises:
-            UnstableError: it is unstable there; the reason, with its number, and a remedy.
+            UnstableError: the actuator is unstable; the message has the number and a remedy.
         """
 
     @property
     def closes_loops(self) -> bool:
-        """True if it may close a loop over its shaft's position or speed, to be checked with what it moves."""
+        """True if the torque may depend on position or speed, and stability on the load."""
         return self.INERTIA or self.MOTION or type(self) not in BUILT_IN
 
     def steps_per_sample(self, timestep: float) -> int:
-        """Return the number of mechanical steps [s] after which its samples repeat."""
+        """Return the number of mechanical steps [s] after which the sample pattern repeats."""
         del timestep
         return 1
 
     def loop_remedy(self, inertia: float) -> str:
-        """Return a sentence on the gains of its loop over a shaft that moves an inertia [kg*m^2], for messages."""
+        """Return a remedy for the loop gains at an inertia [kg*m^2], for error messages."""
         return f"It moves {inertia:.3g} kg*m^2 at its shaft: lower its gains."
 
     def check_at(self, timestep: float, allow_unstable: bool) -> None:
-        """`check`, but what is only unstable may be allowed.
+        """Run `check`, but ignore instability if `allow_unstable`.
 
         Raises:
             ValueError: see `check`.
@@ -273,49 +288,49 @@ class ActuatorModel(fields.Checked):
                 raise
 
     @classmethod
-    def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
-        """How unstable actuators are at a mechanical step: 1 or more, or NaN, where `check` would refuse.
+    def instability(cls, parameter_values: np.ndarray, timestep: float) -> np.ndarray:
+        """Return the instability of many actuators: >= 1 or NaN where `check` would raise.
 
         Args:
-            numbers: shape (m, p), rows as `numbers` returns them.
+            parameter_values: shape (m, p), rows as in `ActuatorModel.parameter_values`.
             timestep: mechanical step [s].
 
         Returns:
             Shape (m,).
         """
         del timestep
-        return np.zeros(len(numbers))
+        return np.zeros(len(parameter_values))
 
     @property
-    def numbers(self) -> tuple[float, ...]:
-        """The parameters, in the order of `parameters_type`: what a model's `user` data hold."""
+    def parameter_values(self) -> tuple[float, ...]:
+        """Parameters in the order of `parameters_type`, as stored in a model's `user` data."""
         return tuple(
             float(value_at(self, path)) for path in parameter_paths(family_of(self)).values()
         )
 
     @classmethod
-    def from_numbers(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
-        """The actuator that `numbers` describe.
+    def from_parameter_values(cls, parameter_values: Any, arm_radius: float = 1.0) -> Any:
+        """Return the actuator with these parameters.
 
         Args:
-            numbers: shape (p,).
-            arm_radius: the arm [m], which is not among them.
+            parameter_values: shape (p,).
+            arm_radius: arm [m], which is not a parameter of `advance`.
 
         Raises:
-            ValueError: a number is out of its field's bounds.
+            ValueError: a value is out of its field's bounds.
         """
         values = dict(
-            zip(parameter_paths(family_of(cls)).values(), map(float, numbers), strict=True)
+            zip(parameter_paths(family_of(cls)).values(), map(float, parameter_values), strict=True)
         )
         values |= {path: arm_radius for path in field_paths(family_of(cls)) if is_arm(path)}
         return from_values(cls, values)
 
     def replaced(self, values: Mapping[str, Any]) -> Self:
-        """A copy with other values of some fields.
+        """Return a copy with new values of some fields.
 
         Args:
-            values: by dotted path, such as `motor.inductance`; in a part that is None, over what
-                stands for it.
+            values: new values by dotted path, such as `motor.inductance`; if a nested part is None,
+                its other fields take the values that None stands for.
 
         Raises:
             ValueError: a value is out of bounds.
@@ -338,24 +353,24 @@ class ActuatorModel(fields.Checked):
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Any:
-        """Build one from nested mappings; absent fields take the dataclasses' defaults.
+        """Build an actuator from nested mappings; missing fields take the dataclasses' defaults.
 
         Args:
             mapping: for example `{"motor": {"inductance": 0.2}, "controller": {"kp": 2.0}}`.
 
         Raises:
-            ValueError: an unknown field (the nearest known one is suggested) or a value out of
+            ValueError: an unknown field (the message suggests the nearest name) or a value out of
                 bounds.
         """
         return fields.build(cls, mapping, "actuator field")
 
     def as_mapping(self) -> dict[str, Any]:
-        """The nested mapping, `family` included, that `actuator_from_mapping` reads."""
+        """Return the nested mapping, including `family`, that `actuator_from_mapping` reads."""
         return {"family": family_name(family_of(self)), **dataclasses.asdict(self)}
 
 
-def advance_form(cls: Family) -> tuple[Form, str]:
-    """What `advance` is to return, and what says so."""
+def advance_signature(cls: Family) -> tuple[Form, str]:
+    """Return the structure that `advance` must return, and the names of its declarations."""
     return (
         cls.State._fields,
         "torque",
@@ -365,7 +380,7 @@ def advance_form(cls: Family) -> tuple[Form, str]:
 
 @functools.cache
 def check_family(cls: Family) -> None:
-    """Refuse a family whose functions do not return what it declares: each is called once on plain numbers."""
+    """Raise if a family's functions, called with sample numbers, do not return what it declares."""
     for name in ("State", "Signals"):
         if not hasattr(kind := getattr(cls, name), "_fields"):
             raise ValueError(
@@ -377,13 +392,13 @@ def check_family(cls: Family) -> None:
         )
     if reserved := {"desired_force", "actual_force", "speed"} & {*cls.Signals._fields}:
         raise ValueError(
-            f"{cls.__name__}.Signals: {', '.join(reserved)}: every family has that: choose another"
+            f"{cls.__name__}.Signals: {', '.join(reserved)}: every family has these: choose another"
             " name"
         )
     fields.check_names(cls.SIGNAL_UNITS, cls.Signals._fields, "signal", "SIGNAL_UNITS.")
     fields.check_names(cls.RANDOM, field_paths(cls), "field", "RANDOM: ")
     if missing := [
-        one.name for one in dataclasses.fields(cls) if one.default is dataclasses.MISSING
+        field.name for field in dataclasses.fields(cls) if field.default is dataclasses.MISSING
     ]:
         raise ValueError(f"{cls.__name__}.{missing[0]}: must have a default")
     actuator = cls()
@@ -392,7 +407,7 @@ def check_family(cls: Family) -> None:
             raise ValueError(
                 f"{cls.__name__}.{path} = {value!r}: must be a number; see `codrl_mj.fields`"
             )
-    parameters, step = parameters_type(cls)(*actuator.numbers), np.float64(1e-3)
+    parameters, step = parameters_type(cls)(*actuator.parameter_values), np.float64(1e-3)
     inputs = Inputs(*map(np.float64, (0.1, 0.2, 0.3, 0.0, 0.0, 1.0)))
     state, signals = (
         kind(*map(np.float64, [0.0] * len(kind._fields))) for kind in (cls.State, cls.Signals)
@@ -400,29 +415,31 @@ def check_family(cls: Family) -> None:
     if cls.advance is ActuatorModel.advance:
         raise ValueError(f"{cls.__name__}: has no `advance`")
     result = call(f"{cls.__name__}.advance", cls.advance, parameters, step, state, inputs)
-    after, torque, _ = check_form(cls.advance, result, *advance_form(cls))
+    after, torque, _ = check_form(cls.advance, result, *advance_signature(cls))
     if not np.isfinite([*after, torque]).all():
         raise ValueError(
             f"{source_location(cls.advance)}: returns the state {(*map(float, after),)} and the torque"
             f" {torque}: must be finite"
         )
     if cls.OBSERVED:
-        seen = call(f"{cls.__name__}.observe", cls.observe, parameters, step, signals, inputs)
-        check_form(cls.observe, seen, cls.OBSERVED, f"{cls.__name__}.OBSERVED")
+        readings = call(f"{cls.__name__}.observe", cls.observe, parameters, step, signals, inputs)
+        check_form(cls.observe, readings, cls.OBSERVED, f"{cls.__name__}.OBSERVED")
 
 
-def reference(cls: type) -> str:
-    """Where a family is to be imported from: `module:Class`."""
+def import_path(cls: type) -> str:
+    """Return the import path of a family: `module:Class`."""
     return f"{cls.__module__}:{cls.__qualname__}"
 
 
 @functools.cache
-def family_number(cls: type) -> int:
-    """The family's number in a model's `user` data: six digits of a hash of `reference`, which survive as text."""
-    return int(hashlib.sha256(reference(cls).encode()).hexdigest(), 16) % 10**6
+def family_id(cls: type) -> int:
+    """Return the family's id in a model's `user` data: six digits of a hash of `import_path`."""
+    # MuJoCo writes user data with six significant digits, so longer ids would not survive saving a
+    # model as XML.
+    return int(hashlib.sha256(import_path(cls).encode()).hexdigest(), 16) % 10**6
 
 
 def family_name(cls: Family) -> str:
-    """The name that `find_family` finds it by."""
+    """Return the name under which `find_family` finds a family."""
     name: str = cls.family
-    return name if FAMILIES.get(name) is cls else reference(cls)
+    return name if FAMILIES.get(name) is cls else import_path(cls)

@@ -1,4 +1,4 @@
-"""Families and actuators by name, and whatever a user may write for an actuator."""
+"""Actuators and families by name, and conversion of user settings to actuators."""
 
 import copy
 import dataclasses
@@ -35,16 +35,16 @@ NAMED: dict[str, tuple[str, Callable[[DCMotorActuator], ActuatorModel]]] = {
         ),
     ),
 }
-"""Name -> (what it is, function from the task's paper actuator to the actuator): variations of the
-task's own motor, so that a name means the same kind of actuator on every task.
+"""Variations of the task's paper actuator, by name: (description, function from the paper's
+actuator to the variation). A name thus means the same kind of actuator on every task.
 """
 
 
 def find_family(name: str) -> Family:
-    """The family called `name`, one of ours or `module:Class` of anybody's, which is imported.
+    """Return the family with a name: a built-in one, or `module:Class`, which is imported.
 
     Raises:
-        ValueError: there is none; the nearest known name is suggested.
+        ValueError: there is no such family; the message suggests the nearest known name.
     """
     family: Family = look_up(name, FAMILIES, "family", base_class=ActuatorModel)
     check_family(family)
@@ -52,7 +52,7 @@ def find_family(name: str) -> Family:
 
 
 def actuator_from_mapping(mapping: Mapping[str, Any]) -> Any:
-    """The actuator that a mapping of its fields describes; without a `family` it is a `current_loop`.
+    """Return the actuator that a mapping of fields describes; `family` defaults to `current_loop`.
 
     Raises:
         ValueError: unknown family or field, or a value out of bounds.
@@ -67,53 +67,59 @@ def actuator_from_mapping(mapping: Mapping[str, Any]) -> Any:
 
 
 def mapping_of(actuator: ActuatorModel) -> dict[str, Any] | None:
-    """The actuator as JSON-serialisable values, which `resolve` reads: None for the ideal one."""
+    """Return an actuator as a JSON mapping that `resolve` reads; None for the ideal actuator."""
     return None if actuator == IDEAL else actuator.as_mapping()
 
 
-def name_of(actuator: ActuatorModel, paper: DCMotorActuator | None = None) -> str:
-    """What to call an actuator wherever it is shown.
+def display_name(actuator: ActuatorModel, paper: DCMotorActuator | None = None) -> str:
+    """Return the name under which an actuator is displayed.
 
-    What it was asked for by (`label_of`), or the motor of the catalogue that has its numbers but
-    for gear, loop and supply; of a current loop the variation of `paper` that it is, `custom` if
-    none; else its family.
+    The name is its label (see `display_label`) if it has one. Otherwise it is the motor of the
+    catalogue with the same numbers, apart from gear, loop and supply; for a current loop the
+    matching variation of `paper`, or `custom`; and for everything else the family.
     """
     kind, known = type(actuator), {}
     if kind is DCMotorActuator:
         known = {name: vary(paper) for name, (_, vary) in NAMED.items()} if paper else {}
-    elif kind is Drive and not label_of(actuator):
+    elif kind is Drive and not display_label(actuator):
         known = _catalogue()
     family = "custom" if kind is DCMotorActuator else family_name(kind)
-    same = (name for name, one in known.items() if one in (actuator, _own_numbers(actuator)))
-    return label_of(actuator) or next(same, family)
+    matches = (
+        name
+        for name, candidate in known.items()
+        if candidate in (actuator, _without_gear(actuator))
+    )
+    return display_label(actuator) or next(matches, family)
 
 
-def names_together(
+def combined_name(
     actuators: Iterable[ActuatorModel], papers: Iterable[DCMotorActuator] | None = None
 ) -> str:
-    """What to call several, each name once."""
+    """Return the display names of several actuators, each name once."""
     pairs = itertools.zip_longest(actuators, papers or ())
-    return ", ".join(dict.fromkeys(name_of(one, paper) for one, paper in pairs))
+    return ", ".join(dict.fromkeys(display_name(actuator, paper) for actuator, paper in pairs))
 
 
-def label_of(actuator: ActuatorModel) -> str:
-    """The motor, file or `module:NAME` that an actuator was asked for by; empty where it was none of these.
+def display_label(actuator: ActuatorModel) -> str:
+    """Return the motor, file or `module:NAME` from which an actuator was made; empty if none.
 
-    It is no field: equality, mappings and hashes of configurations do not know of it.
+    The label is not a field: equality, mappings and hashes of configurations ignore it.
     """
     return str(vars(actuator).get("_label", ""))
 
 
 def set_display_name(actuator: ActuatorModel, label: str) -> Any:
-    """The very actuator, which must be nobody else's, called something from now on; but for the ideal one."""
+    """Set the actuator's display name in place; the shared ideal actuator is left unchanged."""
+    # The dataclass is frozen, so the label is written past its `__setattr__`. Callers pass an
+    # actuator that nothing else refers to.
     if label and actuator is not IDEAL:
         vars(actuator)["_label"] = str(label)
     return actuator
 
 
-def is_family(given: Any) -> bool:
-    """Return True for a class of actuators, which stands for an actuator with its defaults."""
-    return isinstance(given, type) and issubclass(given, ActuatorModel)
+def is_family(value: Any) -> bool:
+    """Return True for a class of actuators, which stands for an actuator with default fields."""
+    return isinstance(value, type) and issubclass(value, ActuatorModel)
 
 
 def _unshared(actuator: ActuatorModel) -> ActuatorModel:
@@ -124,11 +130,14 @@ def _unshared(actuator: ActuatorModel) -> ActuatorModel:
 def _catalogue() -> dict[str, Any]:
     from codrl_mj.catalogue import motor_entry, motor_names
 
-    return {name: _own_numbers(Drive.of(motor_entry(name).numbers)) for name in motor_names()}
+    return {
+        name: _without_gear(Drive.from_motor_parameters(motor_entry(name).parameters))
+        for name in motor_names()
+    }
 
 
-def _own_numbers(actuator: Any) -> Any:
-    """Of a motor all that it is but for the gear that it has here; of other actuators they themselves."""
+def _without_gear(actuator: Any) -> Any:
+    """Return a drive's motor with gear and arm set to 1; other actuators are unchanged."""
     motor = getattr(actuator, "motor", None)
     return (
         dataclasses.replace(motor, gear_ratio=1.0, arm_radius=1.0)
@@ -138,83 +147,92 @@ def _own_numbers(actuator: Any) -> Any:
 
 
 def named_mapping(actuator: ActuatorModel) -> Any:
-    """A mapping for `resolve`: of a motor of the catalogue `name` and what is set over it; else `label` and fields."""
-    name, whole = label_of(actuator), mapping_of(actuator) or {}
+    """Return a short mapping for `resolve`: a catalogue motor's `name` and its changed fields.
+
+    Other actuators give their `label` and all fields.
+    """
+    name, mapping = display_label(actuator), mapping_of(actuator) or {}
     if name in _catalogue() and isinstance(actuator, Drive):
-        there = resolve(name, None, "a motor").as_mapping()
-        short = {
-            part: {key: one for key, one in inner.items() if one != (there[part] or {}).get(key)}
-            for part, inner in whole.items()
-            if inner and inner != there[part]
+        base = resolve(name, None, "a motor").as_mapping()
+        changes = {
+            part: {
+                key: value for key, value in inner.items() if value != (base[part] or {}).get(key)
+            }
+            for part, inner in mapping.items()
+            if inner and inner != base[part]
         }
-        if resolve(found := {"name": name, **short}, None, "a motor") == actuator:
-            return found
-    return {"label": name, **whole} if name else mapping_of(actuator)
+        if resolve(candidate := {"name": name, **changes}, None, "a motor") == actuator:
+            return candidate
+    return {"label": name, **mapping} if name else mapping_of(actuator)
 
 
-def resolve(given: Any, paper: DCMotorActuator | None, whose: str) -> Any:
-    """Turn whatever a user may write for an actuator into an `ActuatorModel`.
+def resolve(actuator: Any, paper: DCMotorActuator | None, owner: str) -> Any:
+    """Convert any user setting for an actuator to an `ActuatorModel`.
 
     Args:
-        given: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file,
+        actuator: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file,
             `module:NAME` of an actuator or a family, a YAML or JSON file of such a mapping, an
-            actuator, a family's class, a mapping of its fields (with a `name`, over that
-            actuator's; with a `label`, what to call it), or None (ideal). Files may be given as a
+            actuator, a family's class, a mapping of its fields (with a `name`: changes to that
+            actuator; with a `label`: its display name), or None (ideal). Files may be given as a
             `pathlib.Path`.
-        paper: the actuator that the names vary; None where there is none.
-        whose: whose it is, for messages.
+        paper: the actuator that the names in `NAMED` vary; None if there is none.
+        owner: description of the owner of the actuator, for messages.
 
     Raises:
         ValueError: unknown name or field, or a value out of bounds.
     """
-    if given is None:
+    if actuator is None:
         return IDEAL
-    if isinstance(given, ActuatorModel):
-        return given
-    if is_family(given):
-        check_family(given)
-        return given()
-    if isinstance(given, Mapping) and "label" in given:
-        rest = {name: value for name, value in given.items() if name != "label"}
-        return set_display_name(_unshared(resolve(rest, paper, whose)), given["label"])
-    if isinstance(given, Mapping) and "name" in given:
-        changes = {name: value for name, value in given.items() if name != "name"}
-        return actuator_over(resolve(given["name"], paper, whose), changes)
-    if isinstance(given, Mapping):
-        return actuator_from_mapping(given)
-    if isinstance(given, Path):
-        given = str(given)
-    if not isinstance(given, str):
+    if isinstance(actuator, ActuatorModel):
+        return actuator
+    if is_family(actuator):
+        check_family(actuator)
+        return actuator()
+    if isinstance(actuator, Mapping) and "label" in actuator:
+        rest = {name: value for name, value in actuator.items() if name != "label"}
+        return set_display_name(_unshared(resolve(rest, paper, owner)), actuator["label"])
+    if isinstance(actuator, Mapping) and "name" in actuator:
+        changes = {name: value for name, value in actuator.items() if name != "name"}
+        return override_actuator(resolve(actuator["name"], paper, owner), changes)
+    if isinstance(actuator, Mapping):
+        return actuator_from_mapping(actuator)
+    if isinstance(actuator, Path):
+        actuator = str(actuator)
+    if not isinstance(actuator, str):
         raise ValueError(
-            f"actuator = {given!r}: must be a name ({', '.join(NAMED)}), an actuator or a mapping"
-            " of its fields"
+            f"actuator = {actuator!r}: must be a name ({', '.join(NAMED)}), an actuator or a"
+            " mapping of its fields"
         )
-    if given == "ideal":
+    if actuator == "ideal":
         return IDEAL
-    if given in NAMED:
+    if actuator in NAMED:
         if paper is None:
             raise ValueError(
-                f"actuator = {given!r}: a variation of the paper's actuator, of which {whose} has"
-                f" none; known are {', '.join(FAMILIES)}"
+                f"actuator = {actuator!r}: a variation of the paper's actuator, but {owner} has"
+                f" none; known names: {', '.join(FAMILIES)}"
             )
-        return NAMED[given][1](paper)
-    if given not in FAMILIES and Path(given).suffix in _FILES:
-        return _from_file(Path(given), paper, whose)
+        return NAMED[actuator][1](paper)
+    if actuator not in FAMILIES and Path(actuator).suffix in _FILES:
+        return _from_file(Path(actuator), paper, owner)
     from codrl_mj.catalogue import motor_entry, motor_names
 
-    if given in motor_names() or Path(given).suffix == ".toml":
-        return set_display_name(Drive.of(motor_entry(given).numbers), Path(given).stem)
-    found = look_up(
-        given,
+    if actuator in motor_names() or Path(actuator).suffix == ".toml":
+        return set_display_name(
+            Drive.from_motor_parameters(motor_entry(actuator).parameters), Path(actuator).stem
+        )
+    imported = look_up(
+        actuator,
         NAMED | FAMILIES,
         "actuator",
         suggestions={"the motors of `codrl-mj motor list`": motor_names()},
     )
-    if is_family(found):
-        return resolve(found, paper, whose)
-    if isinstance(found, ActuatorModel):
-        return set_display_name(_unshared(found), given)
-    raise ValueError(f"actuator = {given!r}: {found!r} is neither an actuator nor a family of them")
+    if is_family(imported):
+        return resolve(imported, paper, owner)
+    if isinstance(imported, ActuatorModel):
+        return set_display_name(_unshared(imported), actuator)
+    raise ValueError(
+        f"actuator = {actuator!r}: {imported!r} must be an actuator or a family of actuators"
+    )
 
 
 _CHANGED = ", changed"
@@ -222,9 +240,10 @@ _FILES = (".yaml", ".yml", ".json")
 
 
 def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
-    """An actuator's fields as its file has them, and what `codrl-mj identify` wrote beside them: `intervals`, `logs`.
+    """Read an actuator's fields from its file, and the `identified` section of `codrl-mj identify`.
 
-    Refuses a file that is no mapping, and one whose motor was not identified: it has a `problem`.
+    Raises if the file is not a mapping, or if the identification failed: the section then has a
+    `problem`.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no actuator file at {path}")
@@ -244,26 +263,34 @@ def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
     return fields, section
 
 
-def _from_file(path: Path, paper: DCMotorActuator | None, whose: str) -> Any:
-    """An actuator from a YAML or JSON file that holds a mapping of its fields."""
+def _from_file(path: Path, paper: DCMotorActuator | None, owner: str) -> Any:
+    """Return the actuator in a YAML or JSON file that holds a mapping of its fields."""
     fields, _ = _read(path)
+    # Only one level of files is followed, which also excludes files that name each other.
     try:
-        other = Path(str(fields.get("name")))
-        if other.suffix in _FILES and Path(str(_read(other)[0].get("name"))).suffix in _FILES:
+        named_file = Path(str(fields.get("name")))
+        if (
+            named_file.suffix in _FILES
+            and Path(str(_read(named_file)[0].get("name"))).suffix in _FILES
+        ):
             raise ValueError(
                 f"name = {fields['name']!r}: must be an actuator's name, or a file that names no"
                 " other"
             )
         with allow_imports_from_files():
-            made = resolve(fields, paper, whose)
+            actuator = resolve(fields, paper, owner)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
+    # Runs save their actuator under a generic file name, so there the folder's name tells more.
     stem = path.stem if path.stem not in ("actuator", "actuators") else path.absolute().parent.name
-    return made if label_of(made) else set_display_name(_unshared(made), stem)
+    return actuator if display_label(actuator) else set_display_name(_unshared(actuator), stem)
 
 
 def identified_ranges(path: Path | str) -> dict[str, str]:
-    """What `randomize` draws of an identified actuator: every ratio alike within each interval, or every number.
+    """Return the distributions that `randomize` draws the fields of an identified actuator from.
+
+    Intervals of positive numbers are drawn log-uniformly, so all ratios are equally likely; others
+    uniformly.
 
     Args:
         path: the actuator's file.
@@ -273,7 +300,7 @@ def identified_ranges(path: Path | str) -> dict[str, str]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it has no intervals, or must not be used.
+        ValueError: the file has no intervals, or the identification failed.
     """
     _, section = _read(Path(path))
     if not section:
@@ -284,60 +311,64 @@ def identified_ranges(path: Path | str) -> dict[str, str]:
     }
 
 
-def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
-    """An actuator with single fields set over another's.
+def override_actuator(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
+    """Return an actuator with some fields changed.
 
     Args:
-        base: the other one.
+        base: actuator to start from.
         changes: nested, for example `{"controller": {"kp": 2.0}}`. A `family` turns a drive into a
-            servo, or back: the motor, the controller and the supply stay the same. A servo that is
-            made so and is given no `loop.velocity_gain` gets `Servo.default_velocity_gain`.
+            servo, or back, with the same motor, controller and supply. A servo that is made in this
+            way gets `Servo.default_velocity_gain` unless `loop.velocity_gain` is specified.
 
     Raises:
-        ValueError: a field is unknown or out of bounds, or set over the ideal actuator, which has
+        ValueError: a field is unknown or out of bounds, or is set on the ideal actuator, which has
             none; or the family is not related to the actuator's.
     """
-    given = {name: value for name, value in changes.items() if value != {}}
+    fields_set = {name: value for name, value in changes.items() if value != {}}
     kind: Any = type(base)
-    family = given.pop("family", family_name(kind))
+    family = fields_set.pop("family", family_name(kind))
     family = family_name(family) if is_family(family) else family
-    if family == family_name(kind) and not given:
+    if family == family_name(kind) and not fields_set:
         return base
     if isinstance(base, Ideal):
         raise ValueError(
-            "the ideal actuator has no motor and no controller to set fields of: name another"
-            " actuator, such as paper"
+            "the ideal actuator has no motor and no controller whose fields could be set: name"
+            " another actuator, such as paper"
         )
     if family != family_name(kind):
         kind = _related_family(family, kind)
-    _check_fields(given, kind)
+    _check_fields(fields_set, kind)
     merged: dict[str, Any] = {
         key: value for key, value in base.as_mapping().items() if key in _field_names(kind)
     }
-    for name, value in given.items():
+    for name, value in fields_set.items():
         inner = merged.get(name)
         merged[name] = {**(inner or {}), **value} if isinstance(value, Mapping) else value
-    made = kind.from_mapping(merged)
+    actuator = kind.from_mapping(merged)
     if (
         issubclass(kind, Servo)
         and not isinstance(base, Servo)
-        and isinstance(given.get("loop", {}), Mapping)
+        and isinstance(fields_set.get("loop", {}), Mapping)
     ):
-        made = made.with_default_gain(given.get("loop", {}))
-    label = label_of(base).removesuffix(_CHANGED)
-    if kind is not type(base) and label:  # a motor's name alone stands for its drive
+        actuator = actuator.with_default_gain(fields_set.get("loop", {}))
+    # The plain name of a catalogue motor means its drive, so for other families the label includes
+    # the family.
+    label = display_label(base).removesuffix(_CHANGED)
+    if kind is not type(base) and label:
         label = label.removesuffix(f" {family_name(type(base))}") + (
             "" if kind is Drive else f" {family}"
         )
     return (
-        set_display_name(made, label + _CHANGED * (_own_numbers(made) != _own_numbers(base)))
+        set_display_name(
+            actuator, label + _CHANGED * (_without_gear(actuator) != _without_gear(base))
+        )
         if label
-        else made
+        else actuator
     )
 
 
 def _related_family(family: str, kind: Any) -> Any:
-    """Return the family of a name, to be set over an actuator of a `kind`: one of the two is a subclass of the other.
+    """Return the family with a name, which must be a subclass or base class of `kind`.
 
     A servo is a drive with outer loops, so a drive's motor, controller and supply become a servo's,
     and back.
@@ -345,15 +376,15 @@ def _related_family(family: str, kind: Any) -> Any:
     Raises:
         ValueError: there is no such family, or it is not related to the kind.
     """
-    other = find_family(family)
-    if not (issubclass(other, kind) or issubclass(kind, other)):
+    related = find_family(family)
+    if not (issubclass(related, kind) or issubclass(kind, related)):
         raise ValueError(
             f"family = {family!r}: cannot be set over an actuator of the family"
-            f" {family_name(kind)!r}, whose fields are others. Name an actuator of a related"
-            f" family, or give all fields of the {family!r} without a name. Motors of `codrl-mj"
+            f" {family_name(kind)!r}, which has different fields. Name an actuator of a related"
+            f" family, or specify all fields of the {family!r} without a name. Motors of `codrl-mj"
             " motor list` and of datasheets are drives, which can become servos"
         )
-    return other
+    return related
 
 
 def _field_names(kind: Any) -> set[str]:
@@ -361,13 +392,13 @@ def _field_names(kind: Any) -> set[str]:
     return {field.name for field in dataclasses.fields(kind)}
 
 
-def _check_fields(given: Mapping[str, Any], kind: Any) -> None:
-    """Refuse fields that the family does not have, but a related family has, with the name of that family."""
-    for name in given:
+def _check_fields(names: Mapping[str, Any], kind: Any) -> None:
+    """Raise if only a related family has one of the fields; the message names that family."""
+    for name in names:
         owners = [
-            other
-            for other, one in FAMILIES.items()
-            if issubclass(one, kind) and name in _field_names(one)
+            family
+            for family, family_class in FAMILIES.items()
+            if issubclass(family_class, kind) and name in _field_names(family_class)
         ]
         if owners and name not in _field_names(kind):
             raise ValueError(
@@ -377,10 +408,10 @@ def _check_fields(given: Mapping[str, Any], kind: Any) -> None:
 
 
 def check_same_family(actuators: Sequence[ActuatorModel]) -> Family:
-    """The family of several actuators that one environment simulates together.
+    """Return the common family of the actuators of one environment.
 
     Raises:
-        ValueError: they are of several.
+        ValueError: the actuators are of several families.
     """
     kinds = {type(actuator) for actuator in actuators}
     if len(kinds) > 1:

@@ -1,4 +1,4 @@
-"""A family's fields as numbers: their dotted paths, their values, and the named tuple that its `advance` takes."""
+"""Fields of an actuator family as numbers: dotted paths, values and parameters of `advance`."""
 
 import dataclasses
 import functools
@@ -11,7 +11,7 @@ from codrl_mj import fields
 
 
 def family_of(actuator: Any) -> Any:
-    """The family of an actuator, or of itself."""
+    """Return the family of an actuator; a family is returned as it is."""
     return actuator if isinstance(actuator, type) else type(actuator)
 
 
@@ -22,7 +22,7 @@ def _fields(cls: type) -> dict[str, dataclasses.Field[Any]]:
 
 
 def value_at(owner: Any, path: str) -> Any:
-    """What stands at a dotted path, a word as its number; in a part that is None, what stands for it."""
+    """Return the value at a dotted path; words are numbers, and a part that is None its default."""
     for name in path.split("."):
         known, value = _fields(family_of(owner)), getattr(owner, name)
         metadata = known[name].metadata if name in known else {}
@@ -33,7 +33,7 @@ def value_at(owner: Any, path: str) -> Any:
 
 
 def as_kind(cls: type, name: str, value: Any) -> Any:
-    """A number as the field's own type: whole numbers, flags and words come as floats from arrays."""
+    """Convert a number to the type of a field; arrays hold integers, flags and words as floats."""
     field = _fields(cls)[name]
     default, options = field.default, field.metadata.get("options", ())
     if options and not isinstance(value, str) and value in range(len(options)):
@@ -46,39 +46,41 @@ def as_kind(cls: type, name: str, value: Any) -> Any:
 
 
 def from_values(cls: type, values: Mapping[str, Any], prefix: str = "") -> Any:
-    """Build a dataclass from values by dotted path; a part whose values stand for None is None."""
-    nested, made = fields.parts(cls), {}
+    """Build a dataclass from values by dotted path; parts equal to their default are None."""
+    nested, values_by_field = fields.parts(cls), {}
     for field in _fields(cls).values():
         if field.name in nested:
             inner = from_values(nested[field.name], values, f"{prefix}{field.name}.")
-            made[field.name] = None if inner == field.metadata.get("absent") else inner
+            values_by_field[field.name] = None if inner == field.metadata.get("absent") else inner
         else:
-            made[field.name] = as_kind(cls, field.name, values[f"{prefix}{field.name}"])
-    return cls(**made)
+            values_by_field[field.name] = as_kind(cls, field.name, values[f"{prefix}{field.name}"])
+    return cls(**values_by_field)
 
 
 def field_values(actuator: Any) -> tuple[float, ...]:
-    """The values of all fields, in the order of `field_paths`: words as their numbers, flags as 0 and 1."""
+    """Return the values of all fields in the order of `field_paths`: words and flags as numbers."""
     return tuple(float(value_at(actuator, path)) for path in field_paths(family_of(actuator)))
 
 
 def from_array(cls: Any, values: Iterable[float]) -> Any:
-    """An actuator of numbers as they are, for what follows from them: a tenth of the time of one that is checked."""
-    left, made = iter(values), object.__new__(cls)
+    """Build an actuator from a vector of field values without validation, ten times faster."""
+    # `object.__new__` skips `__post_init__`, and writing to `vars` is how a frozen dataclass can be
+    # filled without its `__setattr__`.
+    remaining, actuator = iter(values), object.__new__(cls)
     for name, part in _outline(cls):
-        vars(made)[name] = next(left) if part is None else from_array(part, left)
-    return made
+        vars(actuator)[name] = next(remaining) if part is None else from_array(part, remaining)
+    return actuator
 
 
 @functools.cache
 def _outline(cls: Any) -> tuple[tuple[str, Any], ...]:
-    """The fields of a dataclass, each with its class where it is a part, else with None."""
-    nested = fields.parts(cls)
-    return tuple((field.name, nested.get(field.name)) for field in _fields(cls).values())
+    """Return the fields of a dataclass, each with the class of a nested part or with None."""
+    part_types = fields.parts(cls)
+    return tuple((field.name, part_types.get(field.name)) for field in _fields(cls).values())
 
 
 def choices_of(cls: type, path: str) -> tuple[str, ...]:
-    """The words that a field at a dotted path can be; empty if it is a number."""
+    """Return the words that a field at a dotted path accepts; empty if the field is a number."""
     owner: Any = cls
     for name in path.split("."):
         field = next(field for field in dataclasses.fields(owner) if field.name == name)
@@ -88,13 +90,13 @@ def choices_of(cls: type, path: str) -> tuple[str, ...]:
 
 
 def is_arm(path: str) -> bool:
-    """Whether a path is that of the arm, which is no parameter."""
+    """Return True if a path is that of the arm, which is not a parameter of `advance`."""
     return path.rpartition(".")[2] == "arm_radius"
 
 
 @functools.cache
 def field_paths(cls: type) -> tuple[str, ...]:
-    """Dotted paths of all fields of a family, those of its parts too."""
+    """Return the dotted paths of all fields of a family, including those of nested parts."""
     inner = (
         [f"{name}.{path}" for path in field_paths(part)] if part else [name]
         for name, part in _outline(cls)
@@ -104,35 +106,37 @@ def field_paths(cls: type) -> tuple[str, ...]:
 
 @functools.cache
 def parameter_paths(cls: type) -> Mapping[str, str]:
-    """Name -> dotted path of the fields that are parameters of `advance`: all but the arm, which is the gear's.
+    """Return names and dotted paths of the parameters of `advance`: all fields except the arm.
 
-    A parameter is called as its field is, and in a part that may be None by the part's name and the
-    field's.
+    The arm is left out because it is the actuator's gear in the model. A parameter has the name of
+    its field; in a part that may be None, the name is the part's, an underscore and the field's.
 
     Raises:
-        ValueError: two of them have the same name.
+        ValueError: two parameters have the same name.
     """
     optional = {field.name for field in dataclasses.fields(cls) if "absent" in field.metadata}
     paths = [path for path in field_paths(cls) if not is_arm(path)]
-    named = {
+    paths_by_name = {
         path.replace(".", "_") if path.split(".")[0] in optional else path.rpartition(".")[2]: path
         for path in paths
     }
-    if len(named) < len(paths):
-        twice = [path for path in paths if path not in named.values()]
+    if len(paths_by_name) < len(paths):
+        twice = [path for path in paths if path not in paths_by_name.values()]
         raise ValueError(
             f"{cls.__name__}: another parameter has the same name as {', '.join(twice)}: rename one"
         )
-    return named
+    return paths_by_name
 
 
 @functools.cache
 def parameters_type(cls: type) -> Any:
-    """The named tuple that a family's `advance` takes its parameters in."""
-    make: Callable[..., Any] = namedtuple  # mypy wants the names of a named tuple as a literal
-    made = make("Parameters", parameter_paths(cls))
-    made.__reduce__ = lambda self: (_parameters, (cls, *self))  # to be pickled
-    return made
+    """Return the type of the named tuple of parameters that a family's `advance` takes."""
+    # Mypy accepts the field names of a named tuple only as a literal.
+    make: Callable[..., Any] = namedtuple
+    tuple_type = make("Parameters", parameter_paths(cls))
+    # The type is created at run time, so pickle cannot find it by name.
+    tuple_type.__reduce__ = lambda self: (_parameters, (cls, *self))
+    return tuple_type
 
 
 def _parameters(cls: type, *numbers: float) -> Any:

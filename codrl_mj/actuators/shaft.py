@@ -1,8 +1,8 @@
-"""A drive's winding, gear and shaft over some time: the mathematics that `drive` and `servo` share.
+"""Winding, gear and shaft of a drive over some time: the equations shared by `drive` and `servo`.
 
-Within a mechanical step the shaft's speed changes by the motor's own torque, which is known, and by
-whatever else acts on the load, which is taken as it was in the step before: `others`. Where nobody
-knows the inertia the speed is held.
+Within a mechanical step the shaft's speed changes by the motor's torque, which is known, and by
+everything else that acts on the load. That part, `external_acceleration`, is taken from the
+previous step. If the inertia is unknown the speed is held.
 """
 
 import math
@@ -12,86 +12,97 @@ from codrl_mj.actuators import sampled
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 
 RATED_TEMPERATURE = 25.0
-"""Temperature [degC] at which datasheets give resistances."""
+"""Temperature [degC] at which datasheets state resistances."""
 
 
 class Winding(NamedTuple):
-    """Winding and loop at a moment."""
+    """State of winding and loop."""
 
     current: float
-    """[A]"""
+    """Current [A]."""
     integral: float
     """The controller's integral [V]."""
     pending: float
     """Voltage [V] that a delayed loop applies in the next sample."""
 
 
-class Heat(NamedTuple):
-    """How warm the motor is."""
+class TemperatureRises(NamedTuple):
+    """Temperature differences in the motor."""
 
     winding: float
-    """How much warmer [K] the winding is than the housing."""
+    """Difference [K] between winding and housing."""
     housing: float
-    """How much warmer [K] the housing is than the surroundings."""
+    """Difference [K] between housing and surroundings."""
 
 
 class Shaft(NamedTuple):
-    """The rotor at a moment, and what moves it besides the motor."""
+    """State of the rotor, and what moves it besides the motor."""
 
     inertia: float
-    """Inertia [kg*m^2] of all that the rotor moves, itself included; `inf` where its speed is held."""
-    others: float
-    """Acceleration [rad/s^2] by all but the motor's torque."""
+    """Total inertia [kg*m^2] that the rotor moves, including its own; `inf` if its speed is held.
+    """
+    external_acceleration: float
+    """Acceleration [rad/s^2] by everything except the motor's torque."""
     speed: float
-    """[rad/s]"""
+    """Speed [rad/s]."""
 
 
-class Means(NamedTuple):
-    """What there was of a stretch of time, in the mean of it."""
+class StepAverages(NamedTuple):
+    """Averages over a period of time."""
 
     current: float
-    """[A]"""
+    """Current [A]."""
     voltage: float
-    """At the winding's terminals [V]."""
+    """Voltage [V] at the winding's terminals."""
     torque: float
-    """Delivered by the gear, at the rotor's side of it [N*m]."""
+    """Torque [N*m] that the gear delivers, converted to the rotor's side."""
     saturated: float
-    """How many samples were at the voltage's limit."""
+    """Number of samples at the voltage limit."""
     power: float
-    """Into the winding at its terminals [W]."""
+    """Electrical power [W] into the winding at its terminals."""
     heat: float
-    """Lost in the winding [W]: of its resistance and the square of its current, within the samples too."""
+    """Heat [W] in the winding, from its resistance and the squared current within the samples."""
 
 
-def temperature_of(parameters: Any, heat: Heat) -> float:
-    """Of the winding [degC]."""
+def temperature_of(parameters: Any, heat: TemperatureRises) -> float:
+    """Return the temperature [degC] of the winding."""
     return parameters.ambient_temperature + heat.winding + heat.housing
 
 
 def resistance_at(parameters: Any, temperature: float) -> float:
-    """Resistance [ohm] of the winding at a temperature [degC]."""
+    """Return the resistance [ohm] of the winding at a temperature [degC]."""
     return parameters.resistance * (
         1.0 + parameters.resistance_coefficient * (temperature - RATED_TEMPERATURE)
     )
 
 
-def warmer(resistance: float, constant: float, duration: float, rise: float, watts: float) -> float:
-    """Rise [K] over a thermal resistance [K/W] with a time constant [s] after a duration [s] of a held loss [W]."""
-    kept = math.exp(-duration / constant)
-    return rise * kept + resistance * watts * (1.0 - kept)
+def rise_after(
+    resistance: float, constant: float, duration: float, rise: float, watts: float
+) -> float:
+    """Return the temperature rise [K] across a thermal resistance [K/W] after a constant loss [W].
+
+    The rise approaches resistance*watts with a time constant [s] during a duration [s].
+    """
+    decay = math.exp(-duration / constant)
+    return rise * decay + resistance * watts * (1.0 - decay)
 
 
-def heated(parameters: Any, duration: float, heat: Heat, watts: float) -> Heat:
-    """The motor's temperatures after some time [s] of a held loss [W] in the winding: two bodies in a row."""
-    return Heat(
-        warmer(
+def rises_after(
+    parameters: Any, duration: float, heat: TemperatureRises, watts: float
+) -> TemperatureRises:
+    """Return the temperature differences after some time [s] of a constant loss [W] in the winding.
+
+    Winding and housing are two thermal bodies in series.
+    """
+    return TemperatureRises(
+        rise_after(
             parameters.thermal_resistance_winding,
             parameters.thermal_time_constant_winding,
             duration,
             heat.winding,
             watts,
         ),
-        warmer(
+        rise_after(
             parameters.thermal_resistance_housing,
             parameters.thermal_time_constant_housing,
             duration,
@@ -101,27 +112,31 @@ def heated(parameters: Any, duration: float, heat: Heat, watts: float) -> Heat:
     )
 
 
-def thermal_limit(parameters: Any, duration: float, heat: Heat, resistance: float) -> float:
-    """The current [A] that takes the winding to `max_temperature` within some time [s], and no further.
+def thermal_limit(
+    parameters: Any, duration: float, heat: TemperatureRises, resistance: float
+) -> float:
+    """Return the current [A] that heats the winding just to `max_temperature` in some time [s].
 
-    While the motor is cold that is more than it can bear for long; at the limit it falls to the
-    continuous current.
+    While the motor is cold this exceeds the continuous current; at the limit it falls to that.
     """
-    cooled, by_a_watt = (
-        heated(parameters, duration, heat, 0.0),
-        heated(parameters, duration, Heat(0.0, 0.0), 1.0),
+    without_loss, per_watt = (
+        rises_after(parameters, duration, heat, 0.0),
+        rises_after(parameters, duration, TemperatureRises(0.0, 0.0), 1.0),
     )
-    room = (
+    margin = (
         parameters.max_temperature
         - parameters.ambient_temperature
-        - cooled.winding
-        - cooled.housing
+        - without_loss.winding
+        - without_loss.housing
     )
-    return math.sqrt(max(room, 0.0) / (resistance * (by_a_watt.winding + by_a_watt.housing)))
+    return math.sqrt(max(margin, 0.0) / (resistance * (per_watt.winding + per_watt.housing)))
 
 
 def inertia_of(parameters: Any, inertia: float) -> float:
-    """Inertia [kg*m^2] that the rotor moves, by `load_inertia` or the model's; `inf` where the speed is held."""
+    """Return the inertia [kg*m^2] that the rotor moves; `inf` if the speed is held.
+
+    It follows from `load_inertia` if that is specified, and else from the model.
+    """
     if parameters.load_inertia > 0.0:
         inertia = parameters.rotor_inertia + parameters.load_inertia / (
             parameters.gear_ratio * parameters.gear_ratio
@@ -129,69 +144,74 @@ def inertia_of(parameters: Any, inertia: float) -> float:
     return inertia if inertia > 0.0 else math.inf
 
 
-def others_after(timestep: float, change: float, own: float, others: float) -> float:
-    """Acceleration [rad/s^2] of the rotor by all but its motor, from what the last step showed.
+def estimate_external_acceleration(
+    timestep: float, change: float, motor_acceleration: float, external_acceleration: float
+) -> float:
+    """Estimate the acceleration [rad/s^2] of the rotor by everything except its motor.
 
-    Half of it is what was taken then: two joints that move each other, each with a stiff motor,
-    would answer to what the other did a step ago, back and forth. From the rotor's change of speed
-    in the step [rad/s] and, [rad/s^2], its acceleration by the motor's torque and what was taken
-    for that by all else.
+    It is half the last step's observation and half the previous estimate. Without the averaging,
+    two joints that move each other, each with a stiff motor, would react to each other with a delay
+    of a step and oscillate. `change` is the rotor's change of speed [rad/s] in the step, `own` its
+    acceleration [rad/s^2] by the motor's torque.
     """
-    return 0.5 * (change / timestep - own) + 0.5 * others
+    return 0.5 * (change / timestep - motor_acceleration) + 0.5 * external_acceleration
 
 
 def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> float:
-    """Torque [N*m] that Stribeck friction and the gear take from the motor's, by an implicit step.
+    """Return the torque [N*m] of Stribeck friction and gear losses by an implicit step.
 
-    It is against the speed that the shaft would have without it, and at most what stops the shaft:
-    so it never turns the rotor back, and where the inertia is known it holds what pushes less than
-    it: the rotor sticks. Where the speed is held it stops no more than the rotor alone, and nothing
-    sticks. Source: the friction of Duclusaud, Passault, Padois, Ly, *Extended Friction Models for
-    the Physics Simulation of Servo Actuators* (2024), sec. III.
+    It opposes the speed that the shaft would have without it, and is at most the torque that stops
+    the shaft, so it never reverses the rotor. If the inertia is known, it balances any smaller
+    torque: the rotor sticks. If the speed is held, it is at most the torque that stops the rotor
+    alone, and nothing sticks. Source: the friction of Duclusaud, Passault, Padois, Ly, *Extended
+    Friction Models for the Physics Simulation of Servo Actuators* (2024), sec. III.
     """
     if shaft.inertia < math.inf:
-        free = shaft.speed + duration * (torque / shaft.inertia + shaft.others)
-        most = shaft.inertia * abs(free) / duration
+        free_speed = shaft.speed + duration * (torque / shaft.inertia + shaft.external_acceleration)
+        stopping_torque = shaft.inertia * abs(free_speed) / duration
     else:
-        free, rotor = shaft.speed, parameters.rotor_inertia
-        most = rotor * abs(free) / duration if rotor > 0.0 else math.inf
+        free_speed, rotor = shaft.speed, parameters.rotor_inertia
+        stopping_torque = rotor * abs(free_speed) / duration if rotor > 0.0 else math.inf
     efficiency = parameters.gear_efficiency
-    level = abs(torque) * (1.0 - efficiency if torque * free > 0.0 else 1.0 / efficiency - 1.0)
+    level = abs(torque) * (
+        1.0 - efficiency if torque * free_speed > 0.0 else 1.0 / efficiency - 1.0
+    )
     if parameters.stribeck_friction > 0.0:
         ratio = abs(shaft.speed) / parameters.stribeck_speed
         level += parameters.stribeck_friction * math.exp(-(ratio**parameters.stribeck_exponent))
-    return math.copysign(min(level, most), free) if free != 0.0 else 0.0
+    return math.copysign(min(level, stopping_torque), free_speed) if free_speed != 0.0 else 0.0
 
 
-def is_warming(parameters: Any) -> bool:
-    """Whether the motor's temperature changes at all."""
+def has_thermal_model(parameters: Any) -> bool:
+    """Return True if the motor's temperature can change."""
     return parameters.thermal_resistance_winding + parameters.thermal_resistance_housing > 0.0
 
 
-def run_over(
+def advance_winding(
     parameters: Any,
     resistance: float,
     samples: int,
     winding: Winding,
     closed: bool,
-    asked: float,
+    command: float,
     speed: float,
 ) -> tuple[Winding, float, float, int, float, float]:
-    """Winding and loop over some samples at a held speed: at once where that has a closed form.
+    """Advance winding and loop by some samples at a held speed, in closed form if possible.
 
-    The sums that it needs telescope: with S the sum of the current over the samples' starts, the
-    mean of (u - b)/R is (S + (i_n - i_0)/(1 - e))/n, and that of the current, the mean of every
-    sample included, (S + (1 - m)/(1 - e)*(i_n - i_0))/n with m = (1 - e)/x and x = R*T/L. What is
-    drawn and neither moves the rotor nor is left in the winding's field, L*i^2/2, is heat. Where
-    the loop is `closed` a current [A] is asked for, else a voltage [V].
+    The sums telescope: with S the sum of the current over the samples' starts, the mean of (u -
+    b)/R is (S + (i_n - i_0)/(1 - e))/n, and the mean of the current, averaged within every sample,
+    is (S + (1 - m)/(1 - e)*(i_n - i_0))/n with m = (1 - e)/x and x = R*T/L. The energy that is
+    drawn and neither moves the rotor nor remains in the winding's field, L*i^2/2, is heat. If the
+    loop is `closed`, the command is a current [A], else a voltage [V].
 
     Returns:
-        The winding afterwards, the mean current [A], the mean voltage [V], how many samples were
-        saturated, and the mean of the power [W] at the terminals and of the heat [W].
+        The winding afterwards, the mean current [A], the mean voltage [V], the number of saturated
+            samples, and the means of the power [W] at the terminals and of the heat [W].
     """
     sample_time, voltage = 1.0 / parameters.sample_rate, parameters.supply_voltage
     stiff = parameters.delayed == 0.0 and parameters.supply_resistance == 0.0
-    if not closed and stiff:  # nothing changes from sample to sample
+    # A held voltage on a stiff supply makes all samples equal, so they are one long sample.
+    if not closed and stiff:
         sample_time, samples = sample_time * samples, 1
     x = resistance * sample_time / parameters.inductance
     lost = -math.expm1(-x)
@@ -208,10 +228,10 @@ def run_over(
     )
     if as_designed and stiff:
         offset = back_emf - compensated
-        current, integral, total, drawn, saturated = sampled.jump(
+        current, integral, total, drawn, saturated = sampled.solve_designed_loop(
             winding.current,
             (winding.integral - offset) / resistance,
-            asked,
+            command,
             (-voltage - back_emf) / resistance,
             (voltage - back_emf) / resistance,
             samples,
@@ -223,7 +243,7 @@ def run_over(
     else:
         kp, ki = parameters.kp, parameters.ki * sample_time
         if not closed:
-            kp, ki, compensated, asked = 0.0, 0.0, asked, 0.0
+            kp, ki, compensated, command = 0.0, 0.0, command, 0.0
         elif designed:
             kp, ki = sampled.designed_gains(
                 resistance, parameters.inductance, sample_time, y * parameters.sample_rate
@@ -233,7 +253,7 @@ def run_over(
             winding.current,
             winding.integral if closed else 0.0,
             winding.pending,
-            asked,
+            command,
             back_emf,
             compensated,
             samples,
@@ -252,7 +272,7 @@ def run_over(
     return after, mean, back_emf + resistance * (total + change) / samples, saturated, power, heat
 
 
-def turn(
+def advance_motor(
     parameters: Any,
     resistance: float,
     duration: float,
@@ -260,39 +280,40 @@ def turn(
     winding: Winding,
     shaft: Shaft,
     closed: bool,
-    asked: float,
-) -> tuple[Winding, float, Means]:
-    """Winding, loop and shaft over some time under a held command.
+    command: float,
+) -> tuple[Winding, float, StepAverages]:
+    """Advance winding, loop and shaft over some time with a held command.
 
-    Where a saturated voltage meets a light load, the speed cannot be held: c = h*kT*kE/(R*J) is the
-    share of it that the back-EMF takes off in a time h; above 1 it rings, above 2 it grows. So the
-    time is cut into 2*c pieces, and the speed goes on from piece to piece. Found are winding and
-    speed [rad/s] afterwards, and what there was in between.
+    If a saturated voltage meets a light load, the speed cannot be held: c = h*kT*kE/(R*J) is the
+    share of it that the back-EMF removes in a time h; above 1 it oscillates, above 2 it grows. So
+    the time is divided into 2*c pieces, with a new speed for each.
+
+    The result is the winding and the speed [rad/s] afterwards, and the averages.
     """
-    viscous = (
-        parameters.viscous_friction
-    )  # of the joint, which `others` has at the speed of the beginning
+    # Viscous friction belongs to the joint, and `external_acceleration` includes it at the initial
+    # speed. So only the change since then is added.
+    viscous = parameters.viscous_friction
     braking = parameters.torque_constant * parameters.back_emf_constant / resistance + viscous
     pieces = min(max(math.ceil(2.0 * duration * braking / shaft.inertia), 1), samples)
     lossy = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
     amperes, volts, torque, power, heat = 0.0, 0.0, 0.0, 0.0, 0.0
-    saturated, left, speed = 0, samples, shaft.speed
+    saturated, samples_left, speed = 0, samples, shaft.speed
     for piece in range(pieces):
-        count = left // (pieces - piece) if piece < pieces - 1 else left
-        winding, mean, voltage, limited, drawn, lost = run_over(
-            parameters, resistance, count, winding, closed, asked, speed
+        count = samples_left // (pieces - piece) if piece < pieces - 1 else samples_left
+        winding, mean, voltage, limited, power_now, heat_now = advance_winding(
+            parameters, resistance, count, winding, closed, command, speed
         )
-        left, saturated = left - count, saturated + limited
+        samples_left, saturated = samples_left - count, saturated + limited
         share, delivered = count / samples, parameters.torque_constant * mean
         if lossy:
-            now = Shaft(shaft.inertia, shaft.others, speed)
-            delivered -= friction(parameters, share * duration, delivered, now)
+            shaft_now = Shaft(shaft.inertia, shaft.external_acceleration, speed)
+            delivered -= friction(parameters, share * duration, delivered, shaft_now)
         amperes, volts, torque = (
             amperes + share * mean,
             volts + share * voltage,
             torque + share * delivered,
         )
-        power, heat = power + share * drawn, heat + share * lost
-        changed = delivered - viscous * (speed - shaft.speed)
-        speed += share * duration * (changed / shaft.inertia + shaft.others)
-    return winding, speed, Means(amperes, volts, torque, float(saturated), power, heat)
+        power, heat = power + share * power_now, heat + share * heat_now
+        net_torque = delivered - viscous * (speed - shaft.speed)
+        speed += share * duration * (net_torque / shaft.inertia + shaft.external_acceleration)
+    return winding, speed, StepAverages(amperes, volts, torque, float(saturated), power, heat)

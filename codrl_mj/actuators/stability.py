@@ -1,4 +1,4 @@
-"""Stability of discrete closed loops: of controller and winding, and of actuators with the joints that they move."""
+"""Stability of discrete closed loops: current loops, and actuators with their joints."""
 
 import dataclasses
 import math
@@ -11,104 +11,122 @@ from codrl_mj.actuators.model import Inputs, UnstableError
 from codrl_mj.actuators.parameters import parameters_type
 
 
-def columns(family: Any, numbers: np.ndarray) -> Any:
-    """Parameters of m actuators at once, each an array (m,), from rows of numbers (m, p)."""
-    return parameters_type(family)(*numbers.T)
+def parameter_columns(family: Any, parameter_values: np.ndarray) -> Any:
+    """Return the parameters of m actuators, each as an array (m,), from rows of values (m, p)."""
+    return parameters_type(family)(*parameter_values.T)
 
 
 class _Unlimited:
-    """A voltage limit that no voltage reaches, be it a number or an array: it compares as neither above nor below."""
+    """Voltage limit that is never reached: it is neither above nor below any number or array."""
 
     def __neg__(self) -> "_Unlimited":
         return self
 
-    def __lt__(self, other: object) -> bool:
+    def __lt__(self, value: object) -> bool:
         return False
 
-    def __gt__(self, other: object) -> bool:
+    def __gt__(self, value: object) -> bool:
         return False
 
 
 def _closed_loops(
-    family: Any, numbers: np.ndarray, timestep: float
+    family: Any, parameter_values: np.ndarray, timestep: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What an electrical step makes of (current, integral, error), (to, from, actuator), and how many are in a step."""
-    parameters = columns(family, numbers)
+    """Return the matrices of an electrical step, (to, from, actuator), and the number of steps.
+
+    The states are current, integral and error.
+    """
+    parameters = parameter_columns(family, parameter_values)
+    # A unit matrix of states, for all actuators at once, shape (state, state, actuator): linear
+    # equations map it to their own matrix.
     dt = timestep / parameters.substeps
-    current, integral, error = np.eye(3)[
-        :, :, np.newaxis
-    ]  # all states of all actuators at once: (state, actuator)
-    after = family.electrical_step(
+    current, integral, error = np.eye(3)[:, :, np.newaxis]
+    state_after = family.electrical_step(
         parameters, dt, current, integral, error, 0.0, 0.0, 0.0, _Unlimited()
     )[:3]
-    matrices = np.stack([np.broadcast_to(entry, (3, len(numbers))) for entry in after])
-    # what no gain reads is no part of the loop: 0 instead of the eigenvalue of a state of its own
-    read = np.stack([np.ones(len(numbers), dtype=bool), parameters.ki > 0, parameters.kd > 0])
-    return np.where(read[:, np.newaxis] & read, matrices, 0.0), parameters.substeps
+    matrices = np.stack(
+        [np.broadcast_to(entry, (3, len(parameter_values))) for entry in state_after]
+    )
+    # A state that no gain uses is not part of the loop: its entries become 0, so that its own
+    # eigenvalue does not count.
+    is_used = np.stack(
+        [np.ones(len(parameter_values), dtype=bool), parameters.ki > 0, parameters.kd > 0]
+    )
+    return np.where(is_used[:, np.newaxis] & is_used, matrices, 0.0), parameters.substeps
 
 
-def spectral_radii(family: Any, numbers: np.ndarray, timestep: float) -> np.ndarray:
-    """`spectral_radius` of many actuators at once.
+def spectral_radii(family: Any, parameter_values: np.ndarray, timestep: float) -> np.ndarray:
+    """Return the spectral radii of many actuators; see `spectral_radius`.
 
     Args:
-        family: `codrl_mj.actuators.DCMotorActuator`, or one with its fields.
-        numbers: shape (m, p), rows as `ActuatorModel.numbers` has them.
+        family: `codrl_mj.actuators.DCMotorActuator`, or a family with its fields.
+        parameter_values: shape (m, p), rows as in `ActuatorModel.parameter_values`.
         timestep: mechanical step [s].
 
     Returns:
-        Shape (m,); the radius of each does not depend on the others, to the last bit.
+        Shape (m,); each radius is independent of the other actuators, to the last bit.
     """
     with np.errstate(all="ignore"):
-        loops, substeps = _closed_loops(family, numbers, timestep)
+        loops, substeps = _closed_loops(family, parameter_values, timestep)
         matrices = np.moveaxis(loops, 2, 0)
         finite = np.isfinite(matrices).all(axis=(1, 2))
         values = np.linalg.eigvals(np.where(finite[:, np.newaxis, np.newaxis], matrices, 0.0))
         radii = np.abs(values.astype(np.complex128)).max(axis=1)
         radii = np.where(finite, radii, np.inf)
-        return radii**substeps  # a power of the matrix itself would overflow into NaN
+        # The radius is raised to the power, because a power of the matrix could overflow into NaN.
+        return radii**substeps
 
 
 MARGIN = 1e-9
-"""By how much, relative to their terms, Jury's conditions must hold or not: far above the rounding of either method."""
+"""Relative margin by which Jury's conditions must clearly hold or fail, far above the rounding of
+either method.
+"""
 
 
-def stability_radii(family: Any, numbers: np.ndarray, timestep: float) -> np.ndarray:
-    """`spectral_radii`, but 0 or infinity in clear cases, which saves nearly all of the eigenvalues.
+def stability_radii(family: Any, parameter_values: np.ndarray, timestep: float) -> np.ndarray:
+    """Return 0 for stable loops, infinity for unstable ones, and spectral radii in doubt.
+
+    Jury's criterion decides all clear cases, which saves nearly all of the eigenvalues.
 
     Returns:
         Shape (m,): below 1 exactly where the spectral radii are.
     """
     with np.errstate(all="ignore"):
-        (a, b, c), (d, e, f), (g, h, i) = _closed_loops(family, numbers, timestep)[0]
-        # z^3 + two z^2 + one z + zero
-        two = -(a + e + i)
+        (a, b, c), (d, e, f), (g, h, i) = _closed_loops(family, parameter_values, timestep)[0]
+        # The characteristic polynomial is z^3 + quadratic*z^2 + linear*z + constant.
+        quadratic = -(a + e + i)
         linear = (a * e - b * d) + (a * i - c * g) + (e * i - f * h)
-        zero = -(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
-        margin = MARGIN * (1.0 + abs(two) + abs(linear) + abs(zero)) ** 2
-        least = np.minimum(
-            np.minimum(1.0 + two + linear + zero, 1.0 - two + linear - zero), 1.0 - abs(zero)
+        constant = -(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+        margin = MARGIN * (1.0 + abs(quadratic) + abs(linear) + abs(constant)) ** 2
+        smallest = np.minimum(
+            np.minimum(1.0 + quadratic + linear + constant, 1.0 - quadratic + linear - constant),
+            1.0 - abs(constant),
         )
-        last = np.minimum(least, 1.0 - zero * zero - abs(linear - zero * two))
-        least = np.where(least > margin, last, least)
-        radii = np.where(least > margin, 0.0, np.where(least < -margin, np.inf, np.nan))
+        all_conditions = np.minimum(
+            smallest, 1.0 - constant * constant - abs(linear - constant * quadratic)
+        )
+        smallest = np.where(smallest > margin, all_conditions, smallest)
+        radii = np.where(smallest > margin, 0.0, np.where(smallest < -margin, np.inf, np.nan))
     doubtful = np.isnan(radii)
     if doubtful.any():
-        radii[doubtful] = spectral_radii(family, numbers[doubtful], timestep)
+        radii[doubtful] = spectral_radii(family, parameter_values[doubtful], timestep)
     return radii
 
 
 def spectral_radius(actuator: Any, timestep: float) -> float:
-    """Largest absolute eigenvalue of the closed loop over one mechanical step: below 1 the loop is stable.
+    """Return the largest absolute eigenvalue of the closed loop; below 1 the loop is stable.
+
+    It is taken over one mechanical step.
 
     Args:
         actuator: motor and gains.
         timestep: mechanical step [s].
     """
-    return float(spectral_radii(type(actuator), np.array([actuator.numbers]), timestep)[0])
+    return float(spectral_radii(type(actuator), np.array([actuator.parameter_values]), timestep)[0])
 
 
 def check_stable(actuator: Any, timestep: float) -> None:
-    """Refuse an actuator whose closed loop is unstable at this step.
+    """Raise if an actuator's closed loop is unstable at this step.
 
     Args:
         actuator: motor and gains.
@@ -127,6 +145,8 @@ def check_stable(actuator: Any, timestep: float) -> None:
         " do not help"
     )
     for substeps in (gains.substeps * 2**doubling for doubling in range(1, 11)):
+        # The remedy is tried before it is proposed: some loops are unstable at any number of
+        # substeps.
         finer = dataclasses.replace(
             actuator, controller=dataclasses.replace(gains, substeps=substeps)
         )
@@ -142,9 +162,10 @@ def check_stable(actuator: Any, timestep: float) -> None:
 class Joints(NamedTuple):
     """Joints and shafts at rest, linearized without gravity, springs, contacts and limits.
 
-    `inertia` (v, v) and `damping` (v,) are of the degrees of freedom, `moments` (n, v) the speeds
-    of shafts for theirs. The `integrator` is `euler`, which moves positions by the old speeds,
-    `semi-implicit` or `rk4`; unless by RK4, `explicit_damping` damps the old speeds.
+    `inertia` (v, v) and `damping` (v,) are those of the degrees of freedom; `moments` (n, v)
+    convert their speeds to shaft speeds. The `integrator` is `euler`, which moves positions by the
+    old speeds, `semi-implicit` or `rk4`. Except with RK4, `explicit_damping` applies damping to the
+    old speeds.
     """
 
     inertia: np.ndarray
@@ -154,7 +175,10 @@ class Joints(NamedTuple):
     explicit_damping: bool
 
     def transition(self, timestep: float) -> np.ndarray:
-        """Return speeds and shafts' positions after a step, for speeds, positions and held torques: (v + n, v + 2n)."""
+        """Return the map from speeds, positions and torques to new speeds and positions.
+
+        Its shape is (v + n, v + 2n).
+        """
         shafts, freedoms = self.moments.shape
         speeds, positions = slice(freedoms), slice(freedoms, freedoms + shafts)
         after, drag = np.eye(freedoms + 2 * shafts), np.diag(self.damping)
@@ -164,7 +188,8 @@ class Joints(NamedTuple):
                 self.inertia, np.hstack([-drag, 0.0 * self.moments.T, self.moments.T])
             )
             rate[positions, speeds] = self.moments
-            for order in (4, 3, 2, 1):  # Of a linear system RK4 is the Taylor series of order 4.
+            # For a linear system, RK4 is the Taylor series of order 4.
+            for order in (4, 3, 2, 1):
                 after = np.eye(len(rate)) + timestep / order * rate @ after
         else:
             implicit, explicit = (0.0, timestep) if self.explicit_damping else (timestep, 0.0)
@@ -177,10 +202,12 @@ class Joints(NamedTuple):
         return after[: positions.stop]
 
 
-CHANGE = -1e-6
-"""Added to each state in turn. It is negative so that counters and times stay on the side where a sample is due."""
-FREE = {"stribeck_friction": 0.0, "gear_efficiency": 1.0, "deadband": 0.0}
-"""Parameters of families that have them -> values without friction and dead zone, which hide small motions."""
+PERTURBATION = -1e-6
+"""Perturbation added to each state in turn. It is negative so that counters and times stay on the
+side on which a sample is due.
+"""
+WITHOUT_FRICTION = {"stribeck_friction": 0.0, "gear_efficiency": 1.0, "deadband": 0.0}
+"""Parameter values without friction and dead zone, which would hide small motions."""
 
 
 def linearize(
@@ -188,26 +215,29 @@ def linearize(
     advance: Callable[..., Any],
     timestep: float,
     inertia: float,
-    change: float = CHANGE,
+    change: float = PERTURBATION,
 ) -> np.ndarray:
-    """Linearize an actuator's `advance` at rest, for each mechanical step until its samples repeat.
+    """Linearize an actuator's `advance` at rest, for each mechanical step of a sample period.
 
     Args:
         actuator: the actuator.
-        advance: its family's `advance`, compiled or not.
+        advance: `advance` of its family, compiled or not.
         timestep: mechanical step [s].
-        inertia: inertia [kg*m^2] that it is told; `inf` where it is told none.
-        change: what is added to each state in turn.
+        inertia: inertia [kg*m^2] passed to `advance`; `inf` if unknown.
+        change: perturbation added to each state in turn.
 
     Returns:
         Shape (steps, s + 1, s + 2): the new states and the torque, for the states, the position and
-            the speed.
+        the speed.
     """
     family: Any = type(actuator)
     period = actuator.steps_per_sample(timestep)
-    parameters, count = parameters_type(family)(*actuator.numbers), len(family.State._fields)
+    parameters, count = (
+        parameters_type(family)(*actuator.parameter_values),
+        len(family.State._fields),
+    )
     parameters = parameters._replace(
-        **{name: FREE[name] for name in FREE.keys() & {*parameters._fields}}
+        **{name: WITHOUT_FRICTION[name] for name in WITHOUT_FRICTION.keys() & {*parameters._fields}}
     )
     maps, state = [], np.zeros(count)
 
@@ -217,7 +247,7 @@ def linearize(
         after, torque, _ = advance(parameters, timestep, family.State(*states), inputs)
         return np.array([*after, torque])
 
-    # The first period only brings counters and times to where they repeat.
+    # The first period only brings counters and times into their periodic pattern.
     for step in range(2 * period):
         time, point = step * timestep, np.append(state, [0.0, 0.0])
         rest = advanced(point, time)
@@ -229,7 +259,7 @@ def linearize(
 
 
 def loop_radius(joints: Joints, loops: Sequence[np.ndarray], timestep: float) -> float:
-    """Return the spectral radius of actuators and joints together, over the steps after which their samples repeat.
+    """Return the spectral radius of actuators and joints together over a sample period.
 
     Args:
         joints: the joints, with a shaft for each actuator.
@@ -238,30 +268,34 @@ def loop_radius(joints: Joints, loops: Sequence[np.ndarray], timestep: float) ->
     """
     shafts, freedoms = joints.moments.shape
     starts = np.cumsum([freedoms + shafts, *(len(loop[0]) - 1 for loop in loops)])
-    now, transition = np.eye(starts[-1]), joints.transition(timestep)
-    product = now
+    state, transition = np.eye(starts[-1]), joints.transition(timestep)
+    product = state
     for step in range(math.lcm(*map(len, loops))):
-        torques, matrix = np.zeros((shafts, len(now))), np.zeros_like(now)
+        torques, matrix = np.zeros((shafts, len(state))), np.zeros_like(state)
         for index, (loop, start, end) in enumerate(
             zip(loops, starts[:-1], starts[1:], strict=True)
         ):
-            seen = np.vstack(
-                [now[start:end], now[freedoms + index], joints.moments[index] @ now[:freedoms]]
+            inputs = np.vstack(
+                [
+                    state[start:end],
+                    state[freedoms + index],
+                    joints.moments[index] @ state[:freedoms],
+                ]
             )
-            matrix[start:end], torques[index] = np.split(loop[step % len(loop)] @ seen, [-1])
-        matrix[: starts[0]] = transition @ np.vstack([now[: starts[0]], torques])
+            matrix[start:end], torques[index] = np.split(loop[step % len(loop)] @ inputs, [-1])
+        matrix[: starts[0]] = transition @ np.vstack([state[: starts[0]], torques])
         product = matrix @ product
     if not np.isfinite(product).all():
         return math.inf
-    # A state, other than a speed, that nothing else reads, or that nothing else changes, is no part
-    # of a loop.
+    # A state other than a speed that nothing else reads, or that nothing else changes, is not part
+    # of a loop and is removed.
     live, coupled = (
         np.ones(len(product), dtype=bool),
         (product != 0.0) & ~np.eye(len(product), dtype=bool),
     )
     coupled[:freedoms, :freedoms] = True
     while (
-        left := live & coupled[live].any(axis=0) & coupled[:, live].any(axis=1)
+        remaining := live & coupled[live].any(axis=0) & coupled[:, live].any(axis=1)
     ).sum() < live.sum():
-        live = left
+        live = remaining
     return float(np.abs(np.linalg.eigvals(product[np.ix_(live, live)])).max(initial=0.0))

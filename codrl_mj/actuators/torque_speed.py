@@ -1,7 +1,7 @@
-"""A torque source within a motor's torque-speed line, family `torque_speed`.
+"""Torque source limited by a motor's torque-speed line, family `torque_speed`.
 
-What Isaac Lab (`DCMotor`) and mjlab (`DcMotorActuator`) call a DC motor: no winding and no loop,
-only the line that a supply draws through stall torque and no-load speed, and a limit of the torque.
+Isaac Lab (`DCMotor`) and mjlab (`DcMotorActuator`) call this a DC motor. It has no winding and no
+loop, only the line through stall torque and no-load speed, and a torque limit.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from codrl_mj.fields import real
 
 
 class Signals(NamedTuple):
-    """Whether the torque was cut, and the torques [N*m] between which it had to stay."""
+    """Torque limits [N*m] of the last step, and 1 if the torque was clipped."""
 
     lower_limit: float
     upper_limit: float
@@ -27,12 +27,12 @@ def advance(
     state: Nothing,  # noqa: ARG001
     inputs: Inputs,
 ) -> tuple[Nothing, float, Signals]:
-    """Clip the desired torque to the torque-speed line, and both to `max_torque`.
+    """Clip the desired torque to the torque-speed line, and the line to `max_torque`.
 
-    At speed w the voltage that drives forward leaves stall_torque*(1 - w/no_load_speed), the one
-    that drives backward stall_torque*(-1 - w/no_load_speed). Beyond the speeds at which the line
-    reaches +-max_torque it ends there: a controller's current limit holds in every quadrant.
-    Without a `max_torque` the stall torque has its place.
+    At speed w, full forward voltage gives stall_torque*(1 - w/no_load_speed), and full backward
+    voltage stall_torque*(-1 - w/no_load_speed). Where the line exceeds +-max_torque it is cut off:
+    a controller's current limit holds in every quadrant. Without a `max_torque` the limit is the
+    stall torque.
     """
     ratio = inputs.speed / parameters.no_load_speed
     limit = parameters.max_torque if parameters.max_torque < math.inf else parameters.stall_torque
@@ -45,7 +45,7 @@ def advance(
 
 @dataclasses.dataclass(frozen=True)
 class TorqueSpeed(ActuatorModel):
-    """A source of torque that a motor's torque-speed line limits.
+    """Torque source limited by a motor's torque-speed line.
 
     Raises:
         ValueError: a field is out of bounds.
@@ -59,27 +59,31 @@ class TorqueSpeed(ActuatorModel):
     stall_torque: float = real(1.0, above=0.0, unit="N*m")
     """Torque [N*m] at standstill under full voltage, > 0."""
     no_load_speed: float = real(10.0, above=0.0, unit="rad/s")
-    """Speed [rad/s] at which full voltage makes no torque, > 0."""
+    """Speed [rad/s] at which full voltage produces no torque, > 0."""
     max_torque: float = real(math.inf, above=0.0, unit="N*m", infinite=True)
-    """Largest torque [N*m] of the drive, > 0; often well below the stall torque. `inf`: the stall torque."""
+    """Largest torque [N*m] of the drive, > 0; often well below the stall torque. `inf`: the stall
+    torque.
+    """
 
     @property
     def back_emf_damping(self) -> float:
-        """As `ActuatorModel.back_emf_damping`: the slope of the line."""
+        """Slope of the line, as in `ActuatorModel.back_emf_damping`."""
         return self.stall_torque / self.no_load_speed
 
     @property
     def closes_loops(self) -> bool:
-        """True: on its line the torque follows the speed."""
+        """True: on the line, the torque depends on the speed."""
         return True
 
     def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
-        """Refuse a line that overshoots the no-load speed within a step, from step to step and for ever.
+        """Raise if the line is so steep that the speed overshoots more with every step.
 
         Raises:
             UnstableError: with the number and a remedy.
         """
         del held
+        # A held torque changes the speed by this share of its distance to the no-load speed. Above
+        # 1 it overshoots, and at 2 the overshoot no longer decays.
         share = timestep * self.stall_torque / (self.no_load_speed * inertia)
         if share >= 2.0:
             raise UnstableError(

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.fields import Checked, check_memory, check_names, factors
+from codrl_mj.fields import Checked, check_memory, check_names, positive_reals
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +96,7 @@ def check_buffer(name: str, steps: int, env: Any, observations: int) -> None:
 class DeepAgentConfig(AgentConfig):
     """Settings of an agent with neural networks, based on Stable-Baselines3."""
 
-    input_scale: tuple[float, ...] | None = factors()
+    input_scale: tuple[float, ...] | None = positive_reals()
     """Fixed factors > 0 that multiply the observation's entries before they enter a network, in
     order; further entries are not scaled. Velocities of the mountain cars are below 0.07, too small
     for a network to notice.

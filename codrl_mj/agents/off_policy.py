@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from gymnasium import spaces
 
 from codrl_mj.agents.base import DeepAgentConfig, check_buffer
-from codrl_mj.fields import flag, integer, real, units
+from codrl_mj.fields import flag, integer, positive_integers, real
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,21 +16,21 @@ class OffPolicyConfig(DeepAgentConfig):
     algorithm: ClassVar[str]
     """Name of the algorithm's class in `codrl_mj.agents.models`."""
 
-    learning_rate: float = real(1e-3, above=0, most=1)
+    learning_rate: float = real(1e-3, above=0, maximum=1)
     """Adam's step size, in (0, 1]."""
-    gamma: float = real(0.99, above=0, most=1)
+    gamma: float = real(0.99, above=0, maximum=1)
     """Discount factor, in (0, 1]."""
-    tau: float = real(5e-3, above=0, most=1)
+    tau: float = real(5e-3, above=0, maximum=1)
     """Fraction by which each update moves the target networks, in (0, 1]."""
-    buffer_size: int = integer(100_000, least=1)
+    buffer_size: int = integer(100_000, minimum=1)
     """Transitions in the replay buffer, >= 1."""
-    batch_size: int = integer(64, least=1)
+    batch_size: int = integer(64, minimum=1)
     """Transitions in a gradient step, >= 1."""
-    learning_starts: int = integer(1000, least=0)
+    learning_starts: int = integer(1000, minimum=0)
     """Environment steps of uniformly random actions before learning, >= 0."""
-    train_every: int | None = integer(1, least=1, optional=True)
+    train_every: int | None = integer(1, minimum=1, optional=True)
     """Steps of each environment between trainings, >= 1; None: an episode, with `num_envs` = 1."""
-    gradient_steps: int | None = integer(None, least=1)
+    gradient_steps: int | None = integer(None, minimum=1)
     """Gradient steps of a training, >= 1; None: one for each environment step since the last."""
 
     def make_model(self, env: Any, seed: int) -> Any:
@@ -86,11 +86,11 @@ class ActorCriticConfig(OffPolicyConfig):
 
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box,)
 
-    critic_learning_rate: float | None = real(None, above=0, most=1)
+    critic_learning_rate: float | None = real(None, above=0, maximum=1)
     """Adam's step size for the critic, in (0, 1]; None: `learning_rate`."""
-    noise_sigma: float = real(0.0, least=0)
+    noise_sigma: float = real(0.0, minimum=0)
     """Scale sigma of the noise, >= 0, as a fraction of half the action's range; 0: no noise."""
-    noise_theta: float = real(0.15, least=0)
+    noise_theta: float = real(0.15, minimum=0)
     """Rate theta at which the exploration noise returns to 0, >= 0."""
     noise_dt: float = real(1e-2, above=0)
     """Time step dt of the noise, > 0; it is stable if `noise_theta * noise_dt` is below 2."""
@@ -127,19 +127,19 @@ class DDPGConfig(ActorCriticConfig):
     name: ClassVar[str] = "ddpg"
     algorithm: ClassVar[str] = "TwoRateDDPG"
 
-    noise_sigma: float = real(0.2, least=0)
+    noise_sigma: float = real(0.2, minimum=0)
     """Scale sigma of the noise, >= 0, as a fraction of half the action's range; 0: no noise."""
-    actor_units: tuple[int, ...] = units((64, 64))
+    actor_units: tuple[int, ...] = positive_integers((64, 64))
     """Units of the actor's hidden layers. The paper: 64-64."""
-    state_units: tuple[int, ...] = units((16, 32))
+    state_units: tuple[int, ...] = positive_integers((16, 32))
     """Units of the critic's layers for the state only; () passes the state on. The paper: 1
     (pendulum), 64 (car).
     """
-    action_units: tuple[int, ...] = units((32,))
+    action_units: tuple[int, ...] = positive_integers((32,))
     """Units of the critic's layers for the action only; () passes the action on. The paper: 32
     (pendulum), () (car).
     """
-    joint_units: tuple[int, ...] = units((256, 256))
+    joint_units: tuple[int, ...] = positive_integers((256, 256))
     """Units of the critic's joint hidden layers. The paper: 256-256 (pendulum), 64 (car)."""
 
     def _policy_arguments(self) -> dict[str, Any]:
@@ -161,13 +161,13 @@ class TD3Config(ActorCriticConfig):
     name: ClassVar[str] = "td3"
     algorithm: ClassVar[str] = "TwoRateTD3"
 
-    noise_sigma: float = real(0.1, least=0)
+    noise_sigma: float = real(0.1, minimum=0)
     """Scale sigma of the noise, >= 0, as a fraction of half the action's range; 0: no noise."""
-    hidden: tuple[int, ...] = units((64, 64))
+    hidden: tuple[int, ...] = positive_integers((64, 64))
     """Units of the hidden layers of the actor and of each critic (ReLU)."""
-    policy_delay: int = integer(2, least=1)
+    policy_delay: int = integer(2, minimum=1)
     """Critic updates for each update of the actor and the targets, >= 1."""
-    target_noise: float = real(0.2, least=0)
+    target_noise: float = real(0.2, minimum=0)
     """Standard deviation of the noise on the target actions, >= 0, in shares of half the action's
     range; clipped at 2.5 times that.
     """
@@ -191,9 +191,9 @@ class SACConfig(ActorCriticConfig):
     name: ClassVar[str] = "sac"
     algorithm: ClassVar[str] = "TwoRateSAC"
 
-    hidden: tuple[int, ...] = units((64, 64))
+    hidden: tuple[int, ...] = positive_integers((64, 64))
     """Units of the hidden layers of the actor and of each critic (ReLU)."""
-    entropy_coefficient: float | None = real(None, least=0)
+    entropy_coefficient: float | None = real(None, minimum=0)
     """Weight of the entropy, >= 0; None: learned, for an entropy of -1 nat per action entry."""
     state_dependent_noise: bool = flag(False)
     """Explore by noise that is a function of the state, which is drawn at every training (Raffin et
@@ -229,19 +229,19 @@ class DQNConfig(OffPolicyConfig):
     algorithm: ClassVar[str] = "EpisodicDQN"
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Discrete,)
 
-    hidden: tuple[int, ...] = units((64, 128))
+    hidden: tuple[int, ...] = positive_integers((64, 128))
     """Units of the hidden layers (ReLU). The paper: 64-128."""
-    target_every: int = integer(1, least=1)
+    target_every: int = integer(1, minimum=1)
     """Environment steps between two updates of the target network, >= 1."""
-    exploration_start: float = real(1.0, least=0, most=1)
+    exploration_start: float = real(1.0, minimum=0, maximum=1)
     """Probability epsilon of a random action at the start, in [0, 1]."""
-    exploration_end: float = real(0.01, least=0, most=1)
+    exploration_end: float = real(0.01, minimum=0, maximum=1)
     """Smallest epsilon, in [0, 1]."""
-    exploration_decay: float | None = real(0.99, above=0, most=1, optional=True)
+    exploration_decay: float | None = real(0.99, above=0, maximum=1, optional=True)
     """Factor that multiplies epsilon after every episode, in (0, 1]; None: epsilon falls linearly
     over `exploration_fraction`.
     """
-    exploration_fraction: float = real(0.2, above=0, most=1)
+    exploration_fraction: float = real(0.2, above=0, maximum=1)
     """Share of all steps, in (0, 1], over which epsilon falls if `exploration_decay` is None."""
 
     def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 from gymnasium import spaces
 
 from codrl_mj.agents.base import DeepAgentConfig, check_buffer
-from codrl_mj.fields import choice, flag, integer, real, units
+from codrl_mj.fields import choice, flag, integer, positive_integers, real
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,47 +21,47 @@ class PPOConfig(DeepAgentConfig):
     name: ClassVar[str] = "ppo"
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box, spaces.Discrete)
 
-    learning_rate: float = real(1e-3, above=0, most=1)
+    learning_rate: float = real(1e-3, above=0, maximum=1)
     """Adam's step size for the actor, in (0, 1], and for the critic if `critic_learning_rate` is
     None. The paper: 3e-4.
     """
-    critic_learning_rate: float | None = real(None, above=0, most=1)
+    critic_learning_rate: float | None = real(None, above=0, maximum=1)
     """Adam's step size for the critic, in (0, 1]: actor and critic then take separate passes over a
     rollout, and `target_kl` stops only the actor's. None: one optimizer and one loss for both. The
     paper: 1e-3.
     """
-    rollout_steps: int = integer(2048, least=2)
+    rollout_steps: int = integer(2048, minimum=2)
     """Steps of all environments together between two updates, >= 2; a multiple of `num_envs`."""
-    batch_size: int | None = integer(256, least=2, optional=True)
+    batch_size: int | None = integer(256, minimum=2, optional=True)
     """Minibatch size, >= 2, a divisor of `rollout_steps`. None: all of it. The paper: 4000, all."""
-    epochs: int = integer(10, least=1)
+    epochs: int = integer(10, minimum=1)
     """Passes over each rollout, >= 1, unless `target_kl` stops them."""
-    critic_epochs: int | None = integer(None, least=1)
+    critic_epochs: int | None = integer(None, minimum=1)
     """Passes over each rollout for the critic with `critic_learning_rate`, >= 1; None: `epochs`."""
-    gamma: float = real(0.99, above=0, most=1)
+    gamma: float = real(0.99, above=0, maximum=1)
     """Discount factor, in (0, 1]. The paper: 0.99."""
-    gae_lambda: float = real(0.97, least=0, most=1)
+    gae_lambda: float = real(0.97, minimum=0, maximum=1)
     """Lambda of generalized advantage estimation, in [0, 1]. The paper: 0.97."""
     clip_range: float = real(0.2, above=0)
     """Clip range of the probability ratio, > 0. The paper: 0.2."""
-    entropy_coefficient: float = real(0.0, least=0)
+    entropy_coefficient: float = real(0.0, minimum=0)
     """Weight of the entropy bonus, >= 0."""
     target_kl: float | None = real(0.03, above=0, optional=True)
     """Divergence of the policy [nat], > 0; passes over a rollout stop at 1.5 times this. None: they
     never stop. The paper: 0.01.
     """
-    hidden: tuple[int, ...] = units((64, 64))
+    hidden: tuple[int, ...] = positive_integers((64, 64))
     """Units of the hidden layers of the actor, and of the critic. The paper: 64-64."""
     activation: Literal["tanh", "relu"] = choice("tanh", "tanh", "relu")
     """Activation of the hidden layers. The paper: tanh."""
-    log_std_init: float = real(0.0, least=-20, most=10)
+    log_std_init: float = real(0.0, minimum=-20, maximum=10)
     """Continuous actions: natural logarithm of the initial standard deviation, in [-20, 10]."""
     state_dependent_noise: bool = flag(False)
     """Continuous actions: explore by noise that is a function of the state, which is drawn every
     `noise_steps` (Raffin et al., 2021). It moves a system more than independent noise at every
     step.
     """
-    noise_steps: int | None = integer(None, least=1)
+    noise_steps: int | None = integer(None, minimum=1)
     """Steps between two draws of the state-dependent noise, >= 1; None: one draw a rollout."""
 
     unit_actions: bool = flag(False)

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from gymnasium import spaces
 
 from codrl_mj.agents.base import AgentConfig
-from codrl_mj.fields import integer, real, reals, units
+from codrl_mj.fields import integer, positive_integers, real, reals
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,19 +26,19 @@ class SARSAConfig(AgentConfig):
     """Step size alpha of each weight, > 0; 1/tilings would set an estimate to its target in one
     step. The paper: 0.0375.
     """
-    gamma: float = real(1.0, above=0, most=1)
+    gamma: float = real(1.0, above=0, maximum=1)
     """Discount factor, in (0, 1]. The paper: 1."""
-    epsilon: float = real(0.001, least=0, most=1)
+    epsilon: float = real(0.001, minimum=0, maximum=1)
     """Probability of a random action in the first episode, in [0, 1]. The paper: 0.001."""
-    epsilon_decay: float = real(1.0, above=0, most=1)
+    epsilon_decay: float = real(1.0, above=0, maximum=1)
     """Factor that multiplies epsilon after every episode, in (0, 1]. The paper: 1."""
-    trace_decay: float = real(0.0, least=0, most=1)
+    trace_decay: float = real(0.0, minimum=0, maximum=1)
     """Decay lambda of replacing traces, in [0, 1]. The paper: 0, no traces."""
-    tilings: int = integer(8, least=1)
+    tilings: int = integer(8, minimum=1)
     """Number of grids of tiles, a power of 2. The paper: 8."""
-    intervals: tuple[int, ...] = units((8, 8))
+    intervals: tuple[int, ...] = positive_integers((8, 8))
     """Tiles between the bounds, >= 1, of each angle, then of other entries. The paper: 8, 8."""
-    angles: int = integer(0, least=0)
+    angles: int = integer(0, minimum=0)
     """Number of pairs of cosine and sine at the beginning of the observation, each of which is
     tiled as an angle (Acrobot: 2).
     """

@@ -29,7 +29,7 @@ from codrl_mj.compile_cache import njit
 from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.envs.compiled import bind_observation, compiled_kernels
 from codrl_mj.envs.sb3 import ActuatedVecEnv
-from codrl_mj.physics.streams import set_words, words_of
+from codrl_mj.physics.streams import generator_words, set_generator_words
 
 MIN_ELIGIBILITY = 1e-3
 """Eligibility below which a trace is removed."""
@@ -394,11 +394,11 @@ class SARSA(BaseAlgorithm):
 
         The policy and the attributes of Stable-Baselines3 are not part of it.
         """
-        return {"generator": words_of(self._generator)}
+        return {"generator": generator_words(self._generator)}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Restore the result of `snapshot`; training then continues bit-identically."""
-        set_words(self._generator, snapshot["generator"])
+        set_generator_words(self._generator, snapshot["generator"])
 
     def learn(  # type: ignore[override]
         self,

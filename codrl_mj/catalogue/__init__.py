@@ -1,4 +1,4 @@
-"""Off-the-shelf motors: datasheets as they are printed, the numbers that follow from them, and a catalogue."""
+"""Off-the-shelf motors: printed datasheets, the parameters derived from them, and a catalogue."""
 
 from codrl_mj.catalogue.datasheet import (
     Datasheet,
@@ -8,12 +8,12 @@ from codrl_mj.catalogue.datasheet import (
     motor_names,
     new_motor,
 )
-from codrl_mj.catalogue.derivation import Disagreement, MotorNumbers
+from codrl_mj.catalogue.derivation import Disagreement, MotorParameters
 
 __all__ = [
     "Datasheet",
     "from_datasheet",
-    "MotorNumbers",
+    "MotorParameters",
     "Disagreement",
     "MotorEntry",
     "motor_entry",

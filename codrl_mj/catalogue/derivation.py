@@ -1,9 +1,9 @@
-"""From what a datasheet prints to the numbers of a motor: which follows from which, and which have to agree.
+"""Derivation of a motor's parameters from its datasheet: rules, and checks of consistency.
 
-The motor is V = R*I + kE*w with torque kT*I. The gear passes on `gear_efficiency` of it, and
-friction takes its part behind the gear, where the simulation has it: at no load it is
+The motor is V = R*I + kE*w with torque kT*I. The gear transmits `gear_efficiency` of it, and
+friction is subtracted behind the gear, as in the simulation: without load it is
 gear_efficiency*kT*I0. Source of the relations: maxon's *Key information on maxon DC and EC motors*;
-they are those of any text on DC motors.
+they are those of any textbook on DC motors.
 """
 
 import dataclasses
@@ -16,17 +16,17 @@ from typing import Any, NamedTuple
 from codrl_mj.catalogue.units import Kind, Reading
 
 NAME = r"[a-z]\w+"
-"""A quantity in a formula."""
+"""Pattern of a quantity in a formula."""
 
 
 @functools.cache
-def compiled(formula: str) -> CodeType:
-    """A formula to be evaluated among known quantities; its `co_names` are those that it needs."""
+def compile_formula(formula: str) -> CodeType:
+    """Return a compiled formula of known quantities; its `co_names` are those that it needs."""
     return compile(formula, "a rule of the catalogue", "eval")
 
 
-# A quantity, and how it follows from others. Torques at the output, past a gear's losses, have
-# names of their own. The first rule whose needs are known is taken.
+# Each rule is a quantity and a formula for it. The first rule whose quantities are known is
+# applied. Torques at the output, behind the losses of a gear, have their own names.
 RULES = (
     ("resistance", "nominal_voltage / stall_current"),
     (
@@ -94,8 +94,8 @@ _SPEED = (
     " the drive"
 )
 CHECKS = (
-    # a printed quantity, what it should be by the numbers that were found, and what to make of a
-    # difference
+    # A printed quantity, its value according to the derived numbers, and an explanation of a
+    # difference.
     (
         "torque_constant",
         "back_emf_constant",
@@ -168,92 +168,99 @@ CHECKS = (
 
 
 class Disagreement(NamedTuple):
-    """A value that is printed, or a torque constant wherever it came from, and what follows for it from others."""
+    """Disagreement of a printed value, or of a torque constant of any origin, with other values."""
 
     quantity: str
-    """The field."""
+    """Name of the field."""
     printed: float
-    """Its value [unit]."""
+    """Printed value [unit]."""
     computed: float
-    """What follows from the numbers that were derived [unit]."""
+    """Value computed from the derived numbers [unit]."""
     unit: str
-    """SI."""
+    """SI unit of both values."""
     formula: str
-    """How it follows."""
-    reading: str
-    """What to make of it."""
+    """Formula of the computed value."""
+    explanation: str
+    """Explanation of a difference."""
 
     @property
     def difference(self) -> float:
-        """Relative: computed over printed, less 1."""
+        """Relative difference: computed over printed, minus 1."""
         return self.computed / self.printed - 1.0 if self.printed else float("inf")
 
     def __str__(self) -> str:
-        """In a sentence."""
+        """Return the disagreement as a sentence."""
         share = self.difference
-        by = f"{100.0 * share:+.3g}%" if abs(share) < 1.0 else f"{share + 1.0:.3g} times that"
+        difference_text = (
+            f"{100.0 * share:+.3g}%" if abs(share) < 1.0 else f"{share + 1.0:.3g} times that"
+        )
         return (
             f"{self.quantity} = {self.printed:.4g} {self.unit}, but {self.formula} ="
-            f" {self.computed:.4g} {self.unit}, {by}: {self.reading}"
+            f" {self.computed:.4g} {self.unit}, {difference_text}: {self.explanation}"
         )
 
 
 @dataclasses.dataclass(frozen=True)
-class MotorNumbers:
-    """A motor's numbers in SI at the motor's shaft; None where they are unknown."""
+class MotorParameters:
+    """Parameters of a motor in SI units at the motor's shaft; None if unknown."""
 
     resistance: float
-    """[ohm]"""
+    """Terminal resistance [ohm]."""
     inductance: float
-    """[H]"""
+    """Terminal inductance [H]."""
     torque_constant: float
-    """[N*m/A]"""
+    """Torque constant [N*m/A]."""
     back_emf_constant: float
-    """[V*s/rad]"""
+    """Back-EMF constant [V*s/rad]."""
     rotor_inertia: float | None
-    """[kg*m^2]"""
+    """Inertia of the rotor [kg*m^2]."""
     gear_ratio: float
-    """Turns of the motor for a turn of the output; 1 without a gear."""
+    """Turns of the motor per turn of the output; 1 without a gear."""
     gear_efficiency: float | None
-    """Share of the torque that the gear passes on; 1 without a gear."""
+    """Share of the torque that the gear transmits; 1 without a gear."""
     coulomb_friction: float | None
-    """[N*m]"""
+    """Coulomb friction [N*m]."""
     viscous_friction: float | None
-    """[N*m*s/rad]"""
+    """Viscous friction [N*m*s/rad]."""
     max_current: float | None
-    """Of motor or drive [A]."""
+    """Largest current of the motor or the drive [A]."""
     continuous_current: float | None
-    """[A]"""
+    """Permanently permitted current [A]."""
     voltage: float | None
-    """Nominal supply [V]."""
+    """Nominal supply voltage [V]."""
     thermal_resistance: float | None
-    """From winding to ambient [K/W]."""
+    """Thermal resistance from winding to ambient [K/W]."""
     thermal_resistance_winding: float | None
-    """From winding to housing [K/W]."""
+    """Thermal resistance from winding to housing [K/W]."""
     thermal_resistance_housing: float | None
-    """From housing to ambient [K/W]."""
+    """Thermal resistance from housing to ambient [K/W]."""
     thermal_time_constant_winding: float | None
-    """Of the winding against the housing [s]."""
+    """Thermal time constant of the winding relative to the housing [s]."""
     thermal_time_constant_housing: float | None
-    """Of the housing against the ambient [s]."""
+    """Thermal time constant of the housing relative to the ambient [s]."""
     max_temperature: float | None
-    """Of the winding [degC]."""
+    """Largest permissible temperature of the winding [degC]."""
     derived: Mapping[str, str]
-    """For every number above that is known, how it came about."""
+    """Origin of every known number above."""
     disagreements: tuple[Disagreement, ...]
-    """Values that are printed and also follow from others, the worst first; not those that agree to 1e-9."""
+    """Printed values that also follow from others but differ by more than 1e-9, the largest first.
+    """
 
 
 AT_OUTPUT = ("stall_torque_at_output", "continuous_torque_at_output", "torque_constant_at_output")
-"""Torques, and torque per current, past a gear's losses, which tell the motor's only once its efficiency is known."""
-_LEAST_EFFICIENCY = 0.2
-"""No off-the-shelf gear for a servo is worse: a derived efficiency below it is a slip of units."""
-OTHER_NAMES = {
+"""Torques and torque constant behind a gear's losses. They give the motor's values only if its
+efficiency is known.
+"""
+_MIN_EFFICIENCY = 0.2
+"""Lower limit of a derived efficiency. No off-the-shelf servo gear is worse, so a lower value
+indicates wrong units.
+"""
+PRINTED_NAMES = {
     "max_current": "peak_current",
     "voltage": "nominal_voltage",
     "max_temperature": "max_winding_temperature",
 }
-"""Numbers whose printed field is called otherwise."""
+"""Parameters whose printed field has another name."""
 _NEEDED = {
     "resistance": "resistance, or nominal_voltage and stall_current",
     "torque_constant": (
@@ -273,65 +280,72 @@ _NEEDED = {
 
 def derive(
     readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: bool, tolerance: float
-) -> MotorNumbers:
-    """The numbers that follow from what is printed; the arguments and errors of `from_datasheet`."""
+) -> MotorParameters:
+    """Return the parameters that follow from printed values; see `from_datasheet`."""
     if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not tolerance > 0.0:
         raise ValueError(f"tolerance = {tolerance!r}: must be a number > 0, such as 0.2")
     lossy = ("torque_constant",) if strict and _has_loss(readings, kinds, tolerance) else ()
-    found = _Derivation(readings, kinds, lossy)
-    known, how, printed = found.known, found.how, {*found.known, "torque_constant"}
-    known.setdefault("no_load_current", 0.0)
-    found.apply_rules()
+    derivation = _Derivation(readings, kinds, lossy)
+    values, origins, printed = (
+        derivation.values,
+        derivation.origins,
+        {*derivation.values, "torque_constant"},
+    )
+    values.setdefault("no_load_current", 0.0)
+    derivation.apply_rules()
     for name, remedy in _NEEDED.items():
-        if name not in known:
+        if name not in values:
             raise ValueError(
-                f"datasheet.{name} is not printed and does not follow from what is: give {remedy}"
+                f"datasheet.{name} is not printed and does not follow from the printed values:"
+                f" add {remedy}"
             )
-        if not known[name] > 0.0:
+        if not values[name] > 0.0:
             raise ValueError(
-                f"datasheet.{name} = {known[name]:.4g}: must be > 0, but {how[name]}; check these"
-                " values"
+                f"datasheet.{name} = {values[name]:.4g}: must be > 0, but {origins[name]}; check"
+                " these values"
             )
-    found.settle_gear(strict, tolerance)
+    derivation.settle_gear(strict, tolerance)
     if "no_load_current" in printed:
-        found.settle_friction()
-    disagreements = found.disagreements(printed)
+        derivation.settle_friction()
+    disagreements = derivation.disagreements(printed)
     if strict and disagreements and not abs(disagreements[0].difference) <= tolerance:
         worst = disagreements[0]
-        behind = ", ".join(found.behind([worst.quantity, *found.named(worst.formula)]))
-        behind += (
+        sources = ", ".join(
+            derivation.printed_sources([worst.quantity, *derivation.quantities_in(worst.formula)])
+        )
+        sources += (
             ", and at which shaft they are (shaft, gear_ratio)"
-            if known["gear_ratio"] != 1.0
+            if values["gear_ratio"] != 1.0
             else ""
         )
         raise ValueError(
             f"datasheet.{worst.quantity} contradicts the rest by more than {tolerance:.0%}:"
-            f" {worst}. Check the values and units of {behind}; raise tolerance, or pass"
+            f" {worst}. Check the values and units of {sources}; raise tolerance, or pass"
             " strict=False, if the maker does print them so"
         )
-    for name, field in OTHER_NAMES.items():
+    for name, field in PRINTED_NAMES.items():
         if field in printed:
-            known[name], how[name] = (
-                known[field],
-                how[field].replace(field, name, 1) + f" as {field}",
+            values[name], origins[name] = (
+                values[field],
+                origins[field].replace(field, name, 1) + f" as {field}",
             )
-    fields = [
+    names = [
         f.name
-        for f in dataclasses.fields(MotorNumbers)
+        for f in dataclasses.fields(MotorParameters)
         if f.name not in ("derived", "disagreements")
     ]
-    return MotorNumbers(
-        **{name: known.get(name) for name in fields},  # type: ignore[arg-type]
-        derived={name: how[name] for name in fields if name in known},
+    return MotorParameters(
+        **{name: values.get(name) for name in names},  # type: ignore[arg-type]
+        derived={name: origins[name] for name in names if name in values},
         disagreements=disagreements,
     )
 
 
 def _has_loss(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], tolerance: float) -> bool:
-    """Return True if a torque constant printed at the output can only be past the gear's losses, as servos print it.
+    """Return True if a torque constant at the output must include the gear's losses.
 
-    That is, no efficiency is printed, and a gear without losses makes it smaller than the back-EMF
-    constant, which follows from the rest, by more than the tolerance.
+    This is the case if no efficiency is printed, and the constant without losses would be smaller
+    than the back-EMF constant that follows from the rest, by more than the tolerance.
     """
     reading, ratio = readings.get("torque_constant"), readings.get("gear_ratio")
     if (
@@ -341,151 +355,170 @@ def _has_loss(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], tolera
         or "gear_efficiency" in readings
     ):
         return False
-    others = _Derivation(
-        {name: one for name, one in readings.items() if name != "torque_constant"}, kinds
+    derivation_without = _Derivation(
+        {name: value for name, value in readings.items() if name != "torque_constant"}, kinds
     )
-    others.known.setdefault("no_load_current", 0.0)
-    others.apply_rules()
-    constant = others.known.get("back_emf_constant", 0.0)
+    derivation_without.values.setdefault("no_load_current", 0.0)
+    derivation_without.apply_rules()
+    constant = derivation_without.values.get("back_emf_constant", 0.0)
     return bool(reading.value / ratio.value < constant / (1.0 + tolerance))
 
 
 class _Derivation:
-    """What is known of a motor, seen at its shaft, and a sentence on how each number came about."""
+    """Known quantities of a motor at its shaft, each with a sentence on its origin."""
 
     def __init__(
         self, readings: Mapping[str, Reading], kinds: Mapping[str, Kind], lossy: Sequence[str] = ()
     ) -> None:
-        """Begin with what is printed; torques at the output, and what is `lossy`, keep their place, by other names."""
-        self.known: dict[str, Any] = {}
-        self.how: dict[str, str] = {}
+        """Start with the printed values.
+
+        Torques at the output, and quantities in `lossy`, remain at the output under other names.
+        """
+        self.values: dict[str, Any] = {}
+        self.origins: dict[str, str] = {}
         self._units = {name: kind.unit for name, kind in kinds.items()}
         self._units |= {name: self._units[name.removesuffix("_at_output")] for name in AT_OUTPUT}
         for name, (value, printed, shaft) in readings.items():
-            power, at, place = kinds[name].power, name, ""
+            power, quantity, place_text = kinds[name].power, name, ""
             if shaft != "motor" and power != 0:
                 if "gear_ratio" not in readings:
                     raise ValueError(
-                        f"datasheet.{name} = {printed!r} at the output: needs the gear; write"
+                        f"datasheet.{name} = {printed!r} at the output: needs the gear ratio; write"
                         " gear_ratio = 30, or gear_ratio = 1 to describe the motor as it is seen"
                         " at the output"
                     )
-                place = " at the output"
+                place_text = " at the output"
                 if name.endswith("torque") or name in lossy:
-                    at = f"{name}_at_output"
+                    quantity = f"{name}_at_output"
                 else:
                     ratio = readings["gear_ratio"].value
-                    value, place = value * ratio**power, f"{place} * {ratio:g}^{power}"
-            self.known[at], self.how[at] = value, f"{name} = {printed}{place}, printed"
+                    value, place_text = value * ratio**power, f"{place_text} * {ratio:g}^{power}"
+            self.values[quantity], self.origins[quantity] = (
+                value,
+                f"{name} = {printed}{place_text}, printed",
+            )
 
-    def _tells(self, formula: str) -> bool:
-        """Whether all is known that a formula needs."""
-        return self.known.keys() >= {*compiled(formula).co_names}
+    def _can_evaluate(self, formula: str) -> bool:
+        """Return True if all quantities in a formula are known."""
+        return self.values.keys() >= {*compile_formula(formula).co_names}
 
-    def _filled(self, formula: str) -> str:
-        """A formula with numbers and their units for names."""
+    def _substituted(self, formula: str) -> str:
+        """Return a formula with numbers and their units in place of names."""
         return re.sub(
             NAME,
-            lambda match: f"{self.known[match[0]]:.4g} {self._units[match[0]]}".strip(),
+            lambda match: f"{self.values[match[0]]:.4g} {self._units[match[0]]}".strip(),
             formula,
         )
 
-    def _follow(self, name: str, formula: str, value: Any, more: str = "") -> None:
-        """What a quantity is by a formula, and in a sentence."""
-        self.known[name] = value
-        self.how[name] = (
-            f"{name} = {formula} = {self._filled(formula)} = {self._filled(name)}{more}"
+    def _add(self, name: str, formula: str, value: Any, more: str = "") -> None:
+        """Add a quantity, with its formula as its origin."""
+        self.values[name] = value
+        self.origins[name] = (
+            f"{name} = {formula} = {self._substituted(formula)} = {self._substituted(name)}{more}"
         )
 
-    def named(self, formula: str) -> list[str]:
-        """The quantities in a formula."""
+    def quantities_in(self, formula: str) -> list[str]:
+        """Return the quantities in a formula."""
         return [name for name in dict.fromkeys(re.findall(NAME, formula)) if name in self._units]
 
-    def behind(self, names: list[str]) -> list[str]:
-        """The printed quantities that some followed from."""
-        found: list[str] = []
+    def printed_sources(self, names: list[str]) -> list[str]:
+        """Return the printed quantities from which some quantities follow."""
+        sources: list[str] = []
         while names:
             name = names.pop(0)
-            if "printed" in self.how.get(name, "") or name not in self.how:
-                found.append(name)
+            if "printed" in self.origins.get(name, "") or name not in self.origins:
+                sources.append(name)
             else:
-                names += [one for one in self.named(self.how[name]) if one not in (name, *found)]
-        return list(dict.fromkeys(found))
+                names += [
+                    quantity
+                    for quantity in self.quantities_in(self.origins[name])
+                    if quantity not in (name, *sources)
+                ]
+        return list(dict.fromkeys(sources))
 
     def apply_rules(self) -> None:
-        """Apply the first rule that tells something new, until none does."""
-        known = self.known
+        """Apply the first rule that adds a quantity, until there is none."""
+        # The rules are text, so that messages can quote them; they are constants of this module.
+        values = self.values
         while new := next(
-            (rule for rule in RULES if rule[0] not in known and self._tells(rule[1])), None
+            (rule for rule in RULES if rule[0] not in values and self._can_evaluate(rule[1])), None
         ):
             quantity, formula = new
             try:
-                self._follow(quantity, formula, eval(compiled(formula), {}, known))
+                self._add(quantity, formula, eval(compile_formula(formula), {}, values))
             except ZeroDivisionError as error:
                 raise ValueError(
-                    f"datasheet.{quantity}: {formula} = {self._filled(formula)} divides by 0; check"
-                    " these values"
+                    f"datasheet.{quantity}: {formula} = {self._substituted(formula)}"
+                    " divides by 0; check these values"
                 ) from error
 
     def settle_gear(self, strict: bool, tolerance: float) -> None:
-        """Without a gear its ratio and efficiency are 1; a derived efficiency must be one."""
-        known, how = self.known, self.how
+        """Set ratio and efficiency of a missing gear to 1; check a derived efficiency."""
+        values, origins = self.values, self.origins
         for name in ("gear_ratio", "gear_efficiency"):
-            if name not in known and known.get("gear_ratio", 1.0) == 1.0:
-                known[name], how[name] = 1.0, f"{name} = 1: no gear is printed"
-        efficiency = known.get("gear_efficiency")
+            if name not in values and values.get("gear_ratio", 1.0) == 1.0:
+                values[name], origins[name] = 1.0, f"{name} = 1: no gear is printed"
+        efficiency = values.get("gear_efficiency")
         if efficiency is None:
             return
-        if strict and not _LEAST_EFFICIENCY <= efficiency <= 1.0 + tolerance:
+        if strict and not _MIN_EFFICIENCY <= efficiency <= 1.0 + tolerance:
             raise ValueError(
-                f"datasheet.gear_efficiency = {efficiency:.4g}: must be in [{_LEAST_EFFICIENCY:g},"
-                f" 1], but {how['gear_efficiency']}; check the units of these values, the"
+                f"datasheet.gear_efficiency = {efficiency:.4g}: must be in [{_MIN_EFFICIENCY:g},"
+                f" 1], but {origins['gear_efficiency']}; check the units of these values, the"
                 " gear_ratio, and at which shaft they are"
             )
         if efficiency > 1.0:
-            known["gear_efficiency"] = 1.0
-            how["gear_efficiency"] += ", taken as 1"
+            values["gear_efficiency"] = 1.0
+            origins["gear_efficiency"] += ", taken as 1"
 
     def settle_friction(self) -> None:
-        """Friction from the no-load current: all of it Coulomb's, unless one of the two kinds is printed."""
-        known = self.known
-        coulomb, viscous = "coulomb_friction" in known, "viscous_friction" in known
-        total, free = (
-            known["torque_constant"] * known["no_load_current"],
+        """Derive friction from the no-load current; by default it is Coulomb friction."""
+        values = self.values
+        coulomb, viscous = "coulomb_friction" in values, "viscous_friction" in values
+        total, formula = (
+            values["torque_constant"] * values["no_load_current"],
             "torque_constant * no_load_current",
         )
-        if known.get("gear_efficiency", 1.0) != 1.0:  # friction is behind the gear
-            total, free = known["gear_efficiency"] * total, f"gear_efficiency * {free}"
+        # The simulation subtracts friction behind the gear.
+        if values.get("gear_efficiency", 1.0) != 1.0:
+            total, formula = values["gear_efficiency"] * total, f"gear_efficiency * {formula}"
         if not coulomb and not viscous:
-            self._follow("coulomb_friction", free, total)
-            known["viscous_friction"] = 0.0
-            self.how["viscous_friction"] = (
+            self._add("coulomb_friction", formula, total)
+            values["viscous_friction"] = 0.0
+            self.origins["viscous_friction"] = (
                 "viscous_friction = 0: the no-load current is taken as Coulomb friction alone"
             )
-        elif coulomb != viscous and "no_load_speed" in known:
-            speed, more = known["no_load_speed"], ", not below 0"
+        elif coulomb != viscous and "no_load_speed" in values:
+            speed, more = values["no_load_speed"], ", not below 0"
             if coulomb:
-                value = max(0.0, (total - known["coulomb_friction"]) / speed)
-                self._follow(
-                    "viscous_friction", f"({free} - coulomb_friction) / no_load_speed", value, more
+                value = max(0.0, (total - values["coulomb_friction"]) / speed)
+                self._add(
+                    "viscous_friction",
+                    f"({formula} - coulomb_friction) / no_load_speed",
+                    value,
+                    more,
                 )
             else:
-                value = max(0.0, total - known["viscous_friction"] * speed)
-                self._follow(
-                    "coulomb_friction", f"{free} - viscous_friction * no_load_speed", value, more
+                value = max(0.0, total - values["viscous_friction"] * speed)
+                self._add(
+                    "coulomb_friction", f"{formula} - viscous_friction * no_load_speed", value, more
                 )
 
     def disagreements(self, printed: set[str]) -> tuple[Disagreement, ...]:
-        """What is printed and also follows, otherwise; the worst first."""
-        found = []
-        for quantity, formula, reading in CHECKS:
-            if quantity in printed and self._tells(formula):
-                value, computed = self.known[quantity], eval(compiled(formula), {}, self.known)
+        """Return printed values that differ from computed ones, the largest first."""
+        disagreements = []
+        for quantity, formula, explanation in CHECKS:
+            if quantity in printed and self._can_evaluate(formula):
+                value, computed = (
+                    self.values[quantity],
+                    eval(compile_formula(formula), {}, self.values),
+                )
+                # Values that agree so closely were derived from each other.
                 if abs(computed - value) > 1e-9 * abs(value):
-                    text = f"{formula} = {self._filled(formula)}"
-                    found.append(
+                    text = f"{formula} = {self._substituted(formula)}"
+                    disagreements.append(
                         Disagreement(
-                            quantity, value, computed, self._units[quantity], text, reading
+                            quantity, value, computed, self._units[quantity], text, explanation
                         )
                     )
-        return tuple(sorted(found, key=lambda one: -abs(one.difference)))
+        return tuple(sorted(disagreements, key=lambda disagreement: -abs(disagreement.difference)))

@@ -1,4 +1,4 @@
-"""Reads what datasheets print: a number, its unit, and the shaft that it is meant at."""
+"""Parser of printed values: a number, its unit, and the shaft to which it refers."""
 
 import functools
 import math
@@ -15,7 +15,7 @@ _TRANSIT = re.compile(
     rf"\s*(?:{_TIME}\s*(?:/|per)\s*{_ANGLE}|{_ANGLE}\s*(?:/|per)\s*{_TIME})\s*(?:\bat\s+(?:the\s+)?(motor|output))?\s*",
     re.I,
 )
-"""How servos print their speed: the time for an angle, 0.16 s/60deg."""
+"""Pattern of the speed of servos: the time for an angle, such as 0.16 s/60deg."""
 _ANGLES = {
     "radian",
     "degree",
@@ -24,6 +24,8 @@ _ANGLES = {
     "revolutions_per_minute",
     "revolutions_per_second",
 }
+# Regular expressions for spellings that pint does not know, with their replacements. They are
+# applied one after another, so those of whole units precede the general one for hyphens.
 _SPELLINGS = (
     (r"([mkµμ]?N)([cm]?)m\b", r"\1*\2m"),  # mNm, Nm, Ncm
     (r"(k?g)[-.*· ]?([cm]?)m(?:\^2|\*\*2|²|2)", r"\1*\2m**2"),  # gcm2, kg.m²
@@ -59,47 +61,53 @@ _USUAL = {
     "rad/s/V": {"rpm/V": 0.10471975511965977},
     "s": {"s": 1.0, "ms": 1e-3},
 }
-"""SI unit -> what datasheets mostly print, and its size in it: pint's own, which takes longer to load than all else."""
+"""Common units for each SI unit, with their sizes according to pint. Pint itself takes longer to
+load than everything else.
+"""
 
 
 class Kind(NamedTuple):
-    """What may be printed in a field."""
+    """Quantity that a field may hold."""
 
     unit: str
-    """Its SI unit."""
+    """SI unit."""
     example: str
-    """How it may be printed, for messages."""
+    """Example of a printed value, for messages."""
     power: int = 0
-    """A value v at the output of a gear N is v*N**power at the motor's shaft."""
+    """Exponent: a value v at the output of a gear N is v*N**power at the motor's shaft."""
     zero: bool = False
-    """It may be zero."""
+    """True if zero is allowed."""
 
 
 class Reading(NamedTuple):
-    """A printed value, read."""
+    """Parsed value of a datasheet."""
 
     value: float
-    """In the SI unit of its kind."""
+    """Value in the SI unit of its kind."""
     printed: str
-    """As it was printed, without the shaft."""
+    """Printed text without the shaft."""
     shaft: str | None
-    """`motor`, `output`, or None where it does not say."""
+    """`motor`, `output`, or None if not stated."""
 
 
-def read(name: str, printed: Any, kind: Kind) -> Reading:
-    """A printed value in SI, such as `25.1 mN*m/A`, `2 * 0.3 ohm`, `2.42 N*m at output`; without a unit, a number too.
+def parse_value(name: str, printed: Any, kind: Kind) -> Reading:
+    """Parse a printed value, such as `25.1 mN*m/A`, `2 * 0.3 ohm` or `2.42 N*m at output`.
+
+    A quantity without a unit may also be a number.
 
     Raises:
-        ValueError: it has no unit, a wrong or unknown one, more than one number, or it is not
+        ValueError: the value has no unit, a wrong or unknown one, more than one number, or is not
             positive.
     """
     if not kind.unit and isinstance(printed, int | float) and not isinstance(printed, bool):
         printed = str(printed)
+    # A gear ratio may be printed as 30:1.
     if not kind.unit and isinstance(printed, str):
-        printed = re.sub(r"\s*:\s*1\s*$", "", printed)  # 30:1
+        printed = re.sub(r"\s*:\s*1\s*$", "", printed)
     if (
         kind.unit == "rad/s"
         and isinstance(printed, str)
+        # The speed of a servo is printed as the time for an angle.
         and (transit := _TRANSIT.fullmatch(printed))
     ):
         time, milli, angle = (
@@ -122,14 +130,14 @@ def read(name: str, printed: Any, kind: Kind) -> Reading:
         )
     if re.search(r"(?i)\be-?rpm", unit):
         raise ValueError(
-            f"datasheet.{name} = {printed!r}: electrical turns are not the rotor's; divide by the"
-            " pole pairs, write rpm"
+            f"datasheet.{name} = {printed!r}: electrical speed is not that of the rotor; divide"
+            " by the pole pairs, write rpm"
         )
     if not unit and kind.unit:
         raise ValueError(f"datasheet.{name} = {printed!r}: has no unit; {remedy}")
     try:
         value = float(
-            in_si(math.prod(map(float, factors.split("*"))), unit, kind.unit, weights=True)
+            to_si(math.prod(map(float, factors.split("*"))), unit, kind.unit, weights=True)
         )
     except ValueError as error:
         raise ValueError(f"datasheet.{name} = {printed!r}: {error}; {remedy}") from error
@@ -142,41 +150,48 @@ def read(name: str, printed: Any, kind: Kind) -> Reading:
     return Reading(value, f"{factors} {unit}".strip(), shaft)
 
 
-def in_si(
+def to_si(
     number: Any, unit: str, kind: str | None, of: str = "this quantity", weights: bool = False
 ) -> Any:
-    """A number of a unit, as datasheets and loggers spell it, in the SI unit of its kind; of kind None in any.
+    """Convert a number to the SI unit of its kind, or to SI base units for kind None.
 
-    With `weights` a mass stands for its weight where that alone makes sense: kg*cm, oz*in. The
-    error says what is wrong with it as a unit `of` something, and leaves the remedy to who asks.
+    The unit is spelled as in datasheets and logs. With `weights`, a mass stands for its weight if
+    only that makes sense: kg*cm, oz*in. The error explains the problem of the unit, `of` which
+    quantity it is, and leaves the remedy to the caller.
     """
     if kind is not None and unit in (usual := _USUAL.get(kind, {})):
         return number * usual[unit]
     registry = unit_registry()
     for spelling, plain in _SPELLINGS:
         unit = re.sub(spelling, plain, unit)
+    # Pint's parser raises errors of many kinds.
     try:
         quantity = registry.Quantity(number, unit)
-    except Exception as error:  # of any kind: what pint's parser stumbles over
+    except Exception as error:
         raise ValueError(f"the unit {unit!r} is not known") from error
     if kind is None:
         return quantity.to_base_units().magnitude
-    wanted = registry.Quantity(1.0, kind).dimensionality
-    if weights and quantity.dimensionality == wanted / registry.standard_gravity.dimensionality:
+    dimensionality = registry.Quantity(1.0, kind).dimensionality
+    # A torque in kg*cm lacks one standard gravity to be a force times a length.
+    if (
+        weights
+        and quantity.dimensionality == dimensionality / registry.standard_gravity.dimensionality
+    ):
         quantity = quantity * registry.standard_gravity
-    if quantity.dimensionality != wanted:
-        raise ValueError(f"{unit!r} is no unit of {of}, which is in {kind or 'no unit'}")
+    if quantity.dimensionality != dimensionality:
+        raise ValueError(f"{unit!r} is not a unit of {of}, which is in {kind or 'no unit'}")
+    # Pint treats angles as plain numbers, so it would convert Hz and 1/s without a factor of 2*pi.
     units = {name for name, _ in quantity.unit_items()}
     if any(name.endswith("hertz") for name in units) or (
         kind.startswith("rad") and not any(name.endswith(tuple(_ANGLES)) for name in units)
     ):
-        raise ValueError("turns or radians? Hz and 1/s leave it open")
+        raise ValueError("turns or radians? Hz and 1/s are ambiguous")
     return quantity.to(kind or "dimensionless").magnitude
 
 
 @functools.cache
 def unit_registry() -> Any:
-    """Pint's units; half a second, so not before they are needed."""
+    """Return pint's registry of units; importing it takes half a second, so this is lazy."""
     import pint
 
     return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)

@@ -76,7 +76,7 @@ class Advise:
     def run(self) -> tuple[int, Any]:
         """Print the severities, the known remedies, and the verdict last."""
         from codrl_mj.study.advice import advise
-        from codrl_mj.study.doses import REFERENCE_SPEEDS, posed
+        from codrl_mj.study.axes import REFERENCE_SPEEDS, study_env
         from codrl_mj.study.evidence import Evidence
 
         is_studied = self.task in REFERENCE_SPEEDS
@@ -96,7 +96,7 @@ class Advise:
         advice = None
         if is_studied:
             try:
-                actuator = posed(self.task, actuator_spec).actuator
+                actuator = study_env(self.task, actuator_spec).actuator
             except ValueError as error:
                 overrides = {"--gear-ratio": self.gear_ratio, "--voltage": self.voltage}
                 flags = ", ".join(flag for flag, value in overrides.items() if value is not None)
@@ -106,17 +106,17 @@ class Advise:
             print_text(actuator.assumed)
         measured = None
         if self.measure is not None:
-            from codrl_mj.study.advice import decide, measurement
+            from codrl_mj.study.advice import decide, plan_measurement
             from codrl_mj.study.parallel import Workers
             from codrl_mj.study.program import compute
 
             # The run folders below --root hold the finished trainings: a second call computes only
             # the missing ones.
-            measurement_plan = measurement(
+            measurement_plan = plan_measurement(
                 actuator_spec, self.task, self.measure, self.root, trust=self.trust
             )
             compute(measurement_plan.grid, Workers(self.jobs))
-            options = measurement_plan.judged(measurement_plan.grid.collect())
+            options = measurement_plan.loss_bounds(measurement_plan.grid.collect())
             measured = {"options": options, "verdict": decide(options)}
             _print_options(
                 f"Measured: {self.measure} policies of either kind, 50 episodes each", options
@@ -130,11 +130,11 @@ class Advise:
 
 
 def _print_advice(name: str, advice: Any) -> None:
-    from codrl_mj.study.doses import AXES
+    from codrl_mj.study.axes import AXES
 
     columns = "effect on the largest force", "value", "unit"
     rows: list[tuple[Any, ...]] = [
-        (label, format(getattr(advice.found, field), digits), unit)
+        (label, format(getattr(advice.delivery, field), digits), unit)
         for field, (label, unit, digits) in _DELIVERED.items()
     ]
     print_table(f"{name} on {advice.task}, on the bench", columns, rows, right=("value",))
@@ -146,7 +146,7 @@ def _print_advice(name: str, advice: Any) -> None:
             )
             tested = ", ".join(dose.removeprefix(f"{loss.axis} ") for dose in loss.between)
             cells = _loss_cells(loss.outcome, "at least " * loss.beyond)
-            rows.append((loss.axis, f"{loss.dose:.3g}", unit, *cells, tested))
+            rows.append((loss.axis, f"{loss.severity:.3g}", unit, *cells, tested))
         label = "Losses of policies that were trained on ideal forces [shares of the task's span]"
         print_table(
             label,
@@ -172,7 +172,7 @@ def _print_options(title: str, options: Any) -> None:
     rows = []
     for name in OPTIONS:
         if name in options:
-            outcome = options[name].most or options[name].least
+            outcome = options[name].upper or options[name].lower
             rows.append(
                 (
                     name,

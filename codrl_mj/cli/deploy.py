@@ -17,7 +17,7 @@ from codrl_mj.cli.environments import (
 from codrl_mj.cli.parsing import AsJson, Trust, parse_named_numbers
 from codrl_mj.cli.subject import Source, Subject
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.fields import command, differing
+from codrl_mj.fields import command, differences
 
 Exported = Annotated[
     tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER", help="Folder that export wrote.")
@@ -119,7 +119,7 @@ class Export:
         env = build_env_config(self, subject.env.task, self.actuator_name, trained_env)
         if subject.run is None:
             return env
-        if differing_fields := differing(trained_env.as_mapping(), env.as_mapping()):
+        if differing_fields := differences(trained_env.as_mapping(), env.as_mapping()):
             raise ValueError(
                 f"{', '.join(differing_fields)}: the environment that {subject.run} was trained in"
                 " is exported: leave the flags of the environment out; evaluate and board test take"

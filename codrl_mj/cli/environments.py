@@ -17,9 +17,9 @@ from codrl_mj.actuators import (
     DCMotorActuator,
     Ideal,
     Supply,
-    actuator_over,
     find_family,
     identified_ranges,
+    override_actuator,
 )
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.sources import find_source, is_source_name
@@ -158,7 +158,7 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
         ],
         None,
     )
-    # The ideal actuator has no fields. Flags of a current loop let `actuator_over` explain why each
+    # The ideal actuator has no fields. Flags of a current loop let `override_actuator` explain why each
     # of them is refused.
     actuator_flags = flag_dataclass(
         DCMotorActuator if issubclass(family, Ideal) else family, extra_fields=[family_field]
@@ -265,7 +265,7 @@ def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> En
         config = EnvConfig(task, world.overlaid(config, patterns), options=options)
     actuator_fields = _set_fields(verb.actuator_fields)
     overridden = {
-        pattern: actuator_over(actuator, actuator_fields)
+        pattern: override_actuator(actuator, actuator_fields)
         for pattern, actuator in config.actuators_by_name.items()
     }
     return EnvConfig(task, overridden, options=options, **fields)

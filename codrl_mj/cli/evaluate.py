@@ -18,7 +18,7 @@ from codrl_mj.cli.subject import Source
 from codrl_mj.cli.terminal import format_number, print_table, progress_bar
 from codrl_mj.evaluation import MEASURES, Evaluation, evaluate
 from codrl_mj.evaluation.measures import Interval, Quartiles
-from codrl_mj.runs import told_apart
+from codrl_mj.runs import unique_names
 from codrl_mj.runs.files import write_json
 
 
@@ -64,7 +64,7 @@ class Evaluate:
                 " runs/cartpole-ppo-ideal-0"
             )
         jobs, evaluations = {}, {}
-        for path, name in zip(self.policies, told_apart(self.policies), strict=True):
+        for path, name in zip(self.policies, unique_names(self.policies), strict=True):
             verb = self
             if len(self.policies) > 1:
                 # The defaults of the flags come from the first run of a line, so the line is parsed

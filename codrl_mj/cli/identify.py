@@ -334,7 +334,7 @@ class PlanExperiment:
         from codrl_mj.sizing import find_drive, find_entry
 
         sensing, entry = Sensing(**vars(self.sensing)), find_entry(self.name)
-        continuous_current = None if entry is None else entry.numbers.continuous_current
+        continuous_current = None if entry is None else entry.parameters.continuous_current
         limits = self.max_current, math.inf if continuous_current is None else continuous_current
         experiments = plan(
             find_drive(self.name), Load(**vars(self.load)), sensing, self.duration, *limits

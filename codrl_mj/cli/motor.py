@@ -94,7 +94,7 @@ class List:
     def run(self) -> tuple[int, Any]:
         """Print the table."""
         from codrl_mj.catalogue.datasheet import KINDS
-        from codrl_mj.catalogue.derivation import OTHER_NAMES
+        from codrl_mj.catalogue.derivation import PRINTED_NAMES
         from codrl_mj.sizing import catalogue_rows
         from codrl_mj.sizing.abilities import ABILITY_UNITS
 
@@ -118,7 +118,7 @@ class List:
         )
         print_text("at: nominal voltage. –: not on the datasheet; the voltage is then 24 V.")
         print("codrl-mj motor show NAME gives the source of each number")
-        kinds = {name: KINDS.get(OTHER_NAMES.get(name, name)) for name in rows[0]}
+        kinds = {name: KINDS.get(PRINTED_NAMES.get(name, name)) for name in rows[0]}
         units = ABILITY_UNITS | {
             name: kind.unit for name, kind in kinds.items() if kind is not None
         }
@@ -154,7 +154,7 @@ class Show:
         if self.out is not None:
             from codrl_mj.viz.pages.diagrams import torque_speed_diagram
 
-            figure = torque_speed_diagram(drive, entry and entry.numbers)
+            figure = torque_speed_diagram(drive, entry and entry.parameters)
         _print_explanation(
             f"{self.name}: {entry.title}" if entry else "", drive.voltage_limit, explanation
         )
@@ -170,7 +170,7 @@ class Show:
 
 def _print_explanation(title: str, volts: float, explanation: dict[str, Any]) -> None:
     """Print the abilities of a motor, then its numbers, then the notes on them."""
-    from codrl_mj.sizing import unknown_in_words
+    from codrl_mj.sizing import describe_unknown
 
     def show(title: str, part: str) -> None:
         rows = [
@@ -213,7 +213,7 @@ def _print_explanation(title: str, volts: float, explanation: dict[str, Any]) ->
             print_text(
                 *(f"{kind} {text}" if kind == "source" else f"{kind}: {text}" for text in texts)
             )
-        print_text(unknown_in_words(explanation["unknown"]))
+        print_text(describe_unknown(explanation["unknown"]))
 
 
 _DESIGN_COLUMNS = (
@@ -265,7 +265,7 @@ class Design:
 
     def run(self) -> tuple[int, Any]:
         """Print the table and draw the Bode plot."""
-        from codrl_mj.sizing import LoopDesign, design, designs, sampled_too_seldom
+        from codrl_mj.sizing import LoopDesign, design, designs, undersampling_warning
 
         drive = self.changes.drive(self.name)
         chosen, all_designs = design(drive), designs(drive)
@@ -305,7 +305,7 @@ class Design:
         )
         print_text(
             *(f"not possible: {why}" for why in impossible),
-            sampled_too_seldom(drive),
+            undersampling_warning(drive),
             drive.assumed,
         )
         if self.out is not None:
@@ -338,10 +338,10 @@ class Step:
 
     def run(self) -> tuple[int, Any]:
         """Print the table and draw the responses."""
-        from codrl_mj.sizing import sampled_too_seldom, step
+        from codrl_mj.sizing import step_responses, undersampling_warning
 
         drive = self.changes.drive(self.name)
-        steps = step(drive)
+        steps = step_responses(drive)
         small, constant = steps.small, drive.motor.torque_constant
         settled, amplitude = small.settling_time(), float(small.reference[-1])
         responses = steps.recoveries.items()
@@ -366,7 +366,7 @@ class Step:
             for kind, response in recoveries.items()
         ]
         print_table("", columns, rows, right=columns[1:])
-        print_text(sampled_too_seldom(drive), drive.assumed)
+        print_text(undersampling_warning(drive), drive.assumed)
         if self.out is not None:
             from codrl_mj.viz.pages import diagrams
 

@@ -11,7 +11,7 @@ from rich.text import Text
 from codrl_mj.cli.motor import save_plot
 from codrl_mj.cli.parsing import AsJson, Trust
 from codrl_mj.cli.terminal import print_table, print_text
-from codrl_mj.runs import told_apart
+from codrl_mj.runs import unique_names
 
 TaskOrRun = Annotated[
     tyro.conf.Positional[str],
@@ -70,15 +70,18 @@ class Feasible:
             feasibility,
             find_drive,
             find_entry,
-            geared,
-            uncounted,
+            ignored_quantities,
+            with_best_gear,
         )
 
         drive = find_drive(
             self.name, self.gear_ratio, voltage=self.voltage, max_current=self.max_current
         )
         entry = find_entry(self.name)
-        continuous, unknown = entry.numbers.continuous_current if entry else None, uncounted(entry)
+        continuous, unknown = (
+            entry.parameters.continuous_current if entry else None,
+            ignored_quantities(entry),
+        )
         demand = demand_of(self.task_or_run, trust=self.trust, motor=self.motor)
         judgment = feasibility(drive, demand, continuous)
         title = (
@@ -100,19 +103,19 @@ class Feasible:
             rows,
             right=("needs", "has"),
         )
-        operation, best_drive = judgment.operation, geared(drive, demand, continuous)
+        operation, best_drive = judgment.operation, with_best_gear(drive, demand, continuous)
         best_judgment, (low, high) = (
             feasibility(best_drive, demand, continuous),
-            sizing.equal_gears(best_drive, demand, continuous),
+            sizing.equivalent_gears(best_drive, demand, continuous),
         )
         print_text(
             f"{operation.energy_drawn:.3g} J drawn and {operation.copper_loss:.3g} J of heat per"
             f" episode, {operation.rms_current:.3g} A rms; share of rotor and friction in the"
             f" largest load: {_own_share_text(drive, operation)}",
-            *map(str, judgment.in_the_way),
+            *map(str, judgment.failed_bounds),
             f"best {_gear_text(best_drive, demand)}: {best_judgment.verdict}, with a margin of"
             f" {best_judgment.margin:.0%}; the verdict is the same from {low:.3g} to {high:.3g}",
-            _unknown_text(unknown, judgment.why),
+            _unknown_text(unknown, judgment.reason),
             drive.assumed,
         )
         if self.out is not None:
@@ -190,7 +193,7 @@ class Choose:
         """Print the ranking, or for several motors the best choice for each."""
         import yaml
 
-        from codrl_mj.runs.files import writing
+        from codrl_mj.runs.files import atomic_write
         from codrl_mj.sizing import actuators_of, choose, demand_of, demands_of
 
         if self.top < 1:
@@ -225,21 +228,23 @@ class Choose:
         )
         for rank, (name, choice) in enumerate(choices):
             label = f"{choice.name} at {_gear_text(choice.drive, demands[name])}"
-            unknown = _unknown_text(choice.unknown, choice.lacks)
-            notes = "; ".join(filter(None, (choice.lacks, unknown, choice.drive.assumed)))
-            if notes and (choice.lacks or rank < len(shown)):
+            unknown = _unknown_text(choice.unknown, choice.rejection_reason)
+            notes = "; ".join(
+                filter(None, (choice.rejection_reason, unknown, choice.drive.assumed))
+            )
+            if notes and (choice.rejection_reason or rank < len(shown)):
                 print_text(f"{label}: {notes}" if only_demand else f"{name}: {label}: {notes}")
-        unsuitable = [ranking[0].name for ranking in ranked.values() if ranking[0].lacks]
+        unsuitable = [ranking[0].name for ranking in ranked.values() if ranking[0].rejection_reason]
         if self.out is not None:
             gears = [f"-{choice.ratio:.4g}" if self.gears else "" for _, choice in shown]
             stems = [choice.name.removesuffix(Path(choice.name).suffix) for _, choice in shown]
-            motors = told_apart(
+            motors = unique_names(
                 [Path(f"{stem}{gear}") for stem, gear in zip(stems, gears, strict=True)]
             )
             for (name, choice), motor in zip(shown, motors, strict=True):
                 picture = motor.replace("/", "-") if only_demand else name
                 _draw(choice.drive, demands[name], choice.name, self.out / f"{picture}.png")
-            with writing(self.out / "actuators.yaml") as temporary:
+            with atomic_write(self.out / "actuators.yaml") as temporary:
                 chosen = actuators_of(
                     {name: (ranking[0], demands[name]) for name, ranking in ranked.items()}
                 )
@@ -258,8 +263,8 @@ class Choose:
                 "voltage": choice.drive.voltage_limit,
                 "power": choice.power,
                 "verdict": choice.feasibility.verdict,
-                "does_it": not choice.lacks,
-                "lacks": choice.lacks,
+                "does_it": not choice.rejection_reason,
+                "lacks": choice.rejection_reason,
                 "margin": choice.feasibility.margin,
                 **_operation_mapping(choice.feasibility.operation),
                 "unknown": choice.unknown,
@@ -358,7 +363,7 @@ def _print_ranking(
         )
         gear, verdict = (
             _gear_text(choice.drive, demands[name]),
-            Text(choice.feasibility.verdict, "red" if choice.lacks else "green"),
+            Text(choice.feasibility.verdict, "red" if choice.rejection_reason else "green"),
         )
         row = (
             *((name, choice.name) if has_motor_names else (choice.name,)),
@@ -400,4 +405,6 @@ def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
     # it to the gear's output.
     torque = radius * (demand.torque + drive.additions.armature * demand.acceleration)
     points = np.column_stack([demand.speed / radius, torque])
-    save_plot(torque_speed_diagram(drive, None if entry is None else entry.numbers, points), path)
+    save_plot(
+        torque_speed_diagram(drive, None if entry is None else entry.parameters, points), path
+    )

@@ -20,7 +20,7 @@ from codrl_mj.cli.terminal import progress_bar
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.sources import is_source_name
 from codrl_mj.fields import did_you_mean
-from codrl_mj.runs import told_apart
+from codrl_mj.runs import unique_names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Replay(EpisodeVerb):
 
 def _rank_text(verb: Any, env: Any, episode: Any) -> str:
     """Return text that ranks an episode within the run's evaluation, in the same environment."""
-    from codrl_mj.runs.summaries import rank, read_evaluation
+    from codrl_mj.runs.summaries import describe_rank, read_evaluation
 
     evaluation = read_evaluation(Path(verb.subject), verb.source.which == "best") or {}
     try:
@@ -150,7 +150,7 @@ def _rank_text(verb: Any, env: Any, episode: Any) -> str:
         ValueError,
     ):
         is_same_env = False
-    ranking = rank(evaluation, episode.total) if is_same_env else ""
+    ranking = describe_rank(evaluation, episode.total) if is_same_env else ""
     return f": seed {verb.seed}, return {episode.total:.3g}; {ranking}" if ranking else ""
 
 
@@ -233,7 +233,7 @@ class LiveView(EpisodeVerb):
             return loaded.policy
 
         used_names = {*factories, "random", "zero"}
-        for name, run in zip(told_apart(self.policies), self.policies, strict=True):
+        for name, run in zip(unique_names(self.policies), self.policies, strict=True):
             factories[f"run {name}" if name in used_names else name] = functools.partial(
                 load_policy, run
             )

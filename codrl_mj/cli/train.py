@@ -231,7 +231,7 @@ def _result_mapping(run: Path) -> dict[str, Any]:
 def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None]:
     """Show a bar for each training while the block runs, updated from the files of the run folders.
 
-    Any process may write them.
+    Other processes may write them too.
     """
     columns = (
         "{task.completed:,}/{task.total:,} {task.fields[unit]}",

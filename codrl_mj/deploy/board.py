@@ -93,20 +93,20 @@ class Link(Checked):
         ValueError: a field is out of bounds.
     """
 
-    lost: float = real(0.0, least=0.0, most=1.0)
+    lost: float = real(0.0, minimum=0.0, maximum=1.0)
     """Share of the frames that do not arrive at the board."""
-    damaged: float = real(0.0, least=0.0, most=1.0)
+    damaged: float = real(0.0, minimum=0.0, maximum=1.0)
     """Share of the frames in which one bit flips."""
-    late: float = real(0.0, least=0.0, most=1.0)
+    late: float = real(0.0, minimum=0.0, maximum=1.0)
     """Share of the answers that come one period late, so that the previous command still holds."""
-    counts: int = integer(0, least=0)
+    counts: int = integer(0, minimum=0)
     """Encoder counts per turn, to which angles are rounded; 0: exact.
 
     Speeds [rad/s] are rounded to one count per period.
     """
-    current_bits: int = integer(0, least=0)
+    current_bits: int = integer(0, minimum=0)
     """Bits of the current measurement, over the drive's range in both directions; 0: exact."""
-    pwm_bits: int = integer(0, least=0)
+    pwm_bits: int = integer(0, minimum=0)
     """Bits of the bridge's voltage, over the supply voltage in both directions; 0: exact.
 
     A current loop, or the policy itself, commands the voltage.

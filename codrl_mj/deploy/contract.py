@@ -23,8 +23,8 @@ from codrl_mj.deploy.loops import loop_parameters
 from codrl_mj.deploy.network import extract_network
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
-from codrl_mj.fields import check_names, did_you_mean, differing
-from codrl_mj.runs.files import read_json, sealed, write_json
+from codrl_mj.fields import check_names, did_you_mean, differences
+from codrl_mj.runs.files import read_json, with_digest, write_json
 from codrl_mj.runs.policies import Policy
 
 FORMAT = "codrl_mj contract 1"
@@ -281,7 +281,7 @@ class Contract(Interface):
 
     def write(self, folder: Path) -> None:
         """Write `contract.json` into a folder atomically, with a digest of its content."""
-        write_json(folder / FILE, sealed({"format": FORMAT, **dataclasses.asdict(self)}))
+        write_json(folder / FILE, with_digest({"format": FORMAT, **dataclasses.asdict(self)}))
 
     def is_within_limits(self, observations: np.ndarray) -> np.ndarray:
         """Return True for observations (N, k) that are finite and within the limits, shape (N,)."""
@@ -309,8 +309,8 @@ class Contract(Interface):
                 )
             actual = _with_digest(mapping_of(actuators[name]))
             if actual["sha256"] != trained["sha256"]:
-                differences = differing(trained["fields"] or {}, actual["fields"] or {})
-                field, (expected, value) = next(iter(differences.items()), ("family", (None, None)))
+                changed = differences(trained["fields"] or {}, actual["fields"] or {})
+                field, (expected, value) = next(iter(changed.items()), ("family", (None, None)))
                 raise ValueError(
                     f"actuator {name!r}: {field} = {value}, must be {expected}, with which the"
                     " policy was trained; evaluate the policy with yours, or train with it"

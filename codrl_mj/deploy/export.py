@@ -12,7 +12,7 @@ from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.network import Network, extract_network
 from codrl_mj.deploy.tiles import Tiles
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.runs.files import writing_folder
+from codrl_mj.runs.files import atomic_folder
 from codrl_mj.runs.policies import Policy, check_spaces
 
 ONNX, TABLE = "policy.onnx", "table.csv"
@@ -141,7 +141,7 @@ def export(
             f"the exported policy's actions differ by {max_error:.3g} from the original's, must be"
             f" at most {golden['tolerance']:g}: its class computes something else"
         )
-    with writing_folder(out) as folder:
+    with atomic_folder(out) as folder:
         (folder / ONNX).write_bytes(onnx_model(network, metadata).SerializeToString())
         contract.write(folder)
         for name, content in c_files(network, contract).items():

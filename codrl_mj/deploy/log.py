@@ -9,7 +9,7 @@ import numpy as np
 from codrl_mj.deploy.board import OnnxPolicy
 from codrl_mj.deploy.contract import Contract, Interface
 from codrl_mj.evaluation import Episode
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +62,7 @@ def write_log(path: Path, contract: Contract, episode: Episode) -> None:
         episode: episode with the policy.
     """
     motors = _measured(contract, episode)
-    with writing(path) as part, part.open("w", newline="") as file:
+    with atomic_write(path) as part, part.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(
             column_names(contract) + (motor_column_names(contract) if motors.size else [])

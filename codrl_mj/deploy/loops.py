@@ -57,7 +57,7 @@ def loop_parameters(env: EnvConfig) -> dict[str, Any] | None:
         )
     return shared | {
         "kind": "sampled",
-        "sag": first.sag,
+        "sag": first.supply_resistance,
         "rate": loop.sample_rate,
         "most": loop.max_current if np.isfinite(loop.max_current) else None,
         "kp": kp,

@@ -87,7 +87,7 @@ def sample_on_board(
     return quantized(table[16], table[_VOLTAGE]), table[17], table[18]
 
 
-def run_over(
+def advance_winding(
     parameters: Any,
     resistance: float,
     samples: int,
@@ -96,7 +96,7 @@ def run_over(
     command: float,
     speed: float,
 ) -> tuple[Winding, float, float, int, float, float]:
-    """Replace `codrl_mj.actuators.shaft.run_over`: the board closes the loop, sample by sample."""
+    """Replace `codrl_mj.actuators.shaft.advance_winding`: the board closes the loop, sample by sample."""
     # Over a sample the voltage is constant, so the current decays exponentially from its value to
     # its steady state. `decayed` is the share of the distance that it covers.
     x = resistance / (parameters.sample_rate * parameters.inductance)
@@ -173,9 +173,12 @@ def _replace_globals(function: Any, **replacements: Any) -> Any:
     )
 
 
-# A copy of the module, in which `turn` calls the `run_over` of this module.
+# A copy of the module, in which `advance_motor` calls this module's `advance_winding`.
 _shaft = ModuleType("codrl_mj.actuators.shaft")
-vars(_shaft).update(vars(shaft), turn=_replace_globals(shaft.turn, run_over=run_over))
+vars(_shaft).update(
+    vars(shaft),
+    advance_motor=_replace_globals(shaft.advance_motor, advance_winding=advance_winding),
+)
 _ADVANCE = {
     Drive: _replace_globals(drive.advance, _advance=_replace_globals(drive._advance, shaft=_shaft)),
     Servo: _replace_globals(servo.advance, shaft=_shaft),

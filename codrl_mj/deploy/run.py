@@ -24,7 +24,7 @@ from codrl_mj.deploy.wire import (
     Answer,
     Wire,
 )
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 
 MAX_MISSED = 3
 """Number of consecutive frames without an answer after which a run that drives is ended."""
@@ -75,7 +75,11 @@ def run_board(
     """
     contract = Contract.read(folder)
     rows, missed, num_consecutive, late, reason = 0, 0, 0, 0, ""
-    with _open_port(port, baud) as line, writing(log) as part, part.open("w", newline="") as file:
+    with (
+        _open_port(port, baud) as line,
+        atomic_write(log) as part,
+        part.open("w", newline="") as file,
+    ):
         table = csv.writer(file)
         table.writerow(column_names(contract) + motor_column_names(contract))
         wire = Wire(contract, line.fileno(), line.fileno())

@@ -17,8 +17,8 @@ import numpy as np
 from numba import types
 from numba.extending import register_jitable
 
-from codrl_mj.actuators import Family, Inputs, family_number, parameters_type, reference
-from codrl_mj.actuators.model import advance_form, check_family
+from codrl_mj.actuators import Family, Inputs, family_id, import_path, parameters_type
+from codrl_mj.actuators.model import advance_signature, check_family
 from codrl_mj.compile_cache import VerifiedMarker, cfunc
 from codrl_mj.engine.memory import (
     call,
@@ -102,7 +102,7 @@ def signals_offset(family: Family) -> int:
 
 def user_header(family: Family) -> tuple[float, float, float]:
     """Return the header of the `user` data of a family's actuators; the parameters follow it."""
-    return *SIGNATURE, float(family_number(family))
+    return *SIGNATURE, float(family_id(family))
 
 
 def load_family(family: Family) -> None:
@@ -116,24 +116,24 @@ def load_family(family: Family) -> None:
             cannot compile `advance`; or `advance` does not return what the family declares.
     """
     check_family(family)
-    number, sizes = family_number(family), family_sizes(family)
+    number, sizes = family_id(family), family_sizes(family)
     loaded, _ = _COMPILED.get(number, (None, None))
     if loaded is family:
         return
-    if loaded is not None and reference(loaded) != reference(family):
+    if loaded is not None and import_path(loaded) != import_path(family):
         raise ValueError(
-            f"families {reference(family)} and {reference(loaded)} have the same number {number}:"
+            f"families {import_path(family)} and {import_path(loaded)} have the same number {number}:"
             " rename one"
         )
     if loaded is not None and family_sizes(loaded) != sizes:
         raise ValueError(
-            f"family {reference(family)} has {sizes[:3]} states, signals and parameters, and"
+            f"family {import_path(family)} has {sizes[:3]} states, signals and parameters, and"
             f" {family_sizes(loaded)[:3]} when it was loaded before: give it another name, or"
             " restart Python"
         )
     if family.INERTIA:
         load_inertia()
-    function, text = _compile(family), ctypes.create_string_buffer(reference(family).encode())
+    function, text = _compile(family), ctypes.create_string_buffer(import_path(family).encode())
     _SIZES[number], _REFERENCES[number] = (*sizes, slot_size(family)), ctypes.addressof(text)
     # The function's address is set last: with it the family counts as compiled.
     _ADDRESSES[number] = function.address
@@ -154,7 +154,7 @@ def family_replaced(family: Family, replacement: Family) -> Iterator[None]:
     Both families must have the same states and signals.
     """
     load_family(family)
-    number, function = family_number(family), _compile(replacement)
+    number, function = family_id(family), _compile(replacement)
     original = _ADDRESSES[number]
     _ADDRESSES[number] = function.address
     try:
@@ -237,7 +237,7 @@ def _compile(family: Any) -> Any:
         named_tuple_type(state_of),
         named_tuple_type(Inputs),
     )
-    advance = compiled_function(family.advance, *advance_form(family), *kinds)
+    advance = compiled_function(family.advance, *advance_signature(family), *kinds)
 
     @cfunc(_ADVANCE_TYPE, nogil=True, error_model="numpy")
     def step(

@@ -17,7 +17,7 @@ from typing import Any
 import mujoco
 from numba import types
 
-from codrl_mj.actuators import BUILT_IN, Ideal, family_number, reference
+from codrl_mj.actuators import BUILT_IN, Ideal, family_id, import_path
 from codrl_mj.compile_cache import cfunc, external_function, njit
 from codrl_mj.engine.families import (
     INERTIA,
@@ -65,7 +65,7 @@ _GAINS, _BIASES, _DYNAMICS = mujoco.mjNGAIN, mujoco.mjNBIAS, mujoco.mjNDYN
 _AFFINE_GAIN, _AFFINE_BIAS = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
 _EXACT_FILTER, _MIN_VALUE = int(mujoco.mjtDyn.mjDYN_FILTEREXACT), mujoco.mjMINVAL
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-_IDEAL = family_number(Ideal)
+_IDEAL = family_id(Ideal)
 _FIRST, _SECOND = SIGNATURE
 
 
@@ -292,7 +292,7 @@ def _family(model: int, instance: int) -> Any:
     text = _get_config(model, instance, ctypes.addressof(_ATTRIBUTE))
     name = ctypes.string_at(text).decode() if text else ""
     for family in (*loaded_families(), *BUILT_IN):
-        if reference(family) == name:
+        if import_path(family) == name:
             return family
     raise ValueError(
         f"its family {name!r} is not loaded, and a model cannot have it imported: import its"

@@ -11,12 +11,12 @@ from codrl_mj.actuators import (
     ActuatorModel,
     Family,
     UnstableError,
-    family_number,
+    family_id,
+    import_path,
     parameters_type,
-    reference,
     stability,
 )
-from codrl_mj.actuators.noise import LARGEST_KEY
+from codrl_mj.actuators.noise import MAX_KEY
 from codrl_mj.engine.families import (
     SIGNATURE,
     USER_HEADER_SIZE,
@@ -91,7 +91,7 @@ def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:
     if uses_plugin and (len(user) < PLUGIN_HEADER_SIZE or tuple(user[:2]) != SIGNATURE):
         raise ValueError(REASONS[1])
     families: dict[float, Family] = {
-        family_number(family): family for family in (*BUILT_IN, *loaded_families())
+        family_id(family): family for family in (*BUILT_IN, *loaded_families())
     }
     family = families.get(user[2])
     if family is None:
@@ -105,9 +105,9 @@ def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:
         name = (
             bytes(model.plugin_attr[model.plugin_attradr[instance] :]).partition(b"\0")[0].decode()
         )
-        if name != reference(family):
+        if name != import_path(family):
             raise ValueError(
-                f"{FAMILY} = {name!r} of its plugin: must be {reference(family)!r}, as in its user"
+                f"{FAMILY} = {name!r} of its plugin: must be {import_path(family)!r}, as in its user"
                 " data"
             )
         if model.plugin_statenum[instance] != size + EXTRA_STATES:
@@ -144,7 +144,7 @@ def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:
         raise ValueError(
             f"user = {list(user)}: a {family.__name__} needs {head} numbers and {', '.join(names)}"
         )
-    return family.from_numbers(user[head : head + len(names)], arm)
+    return family.from_parameter_values(user[head : head + len(names)], arm)
 
 
 def motor_slots(
@@ -187,7 +187,7 @@ def clear_motors(data: mujoco.MjData, noise_keys: Sequence[int] | None = None) -
             " model"
         )
     for index, key in enumerate(keys):
-        if not (isinstance(key, numbers.Real) and 0 <= key < LARGEST_KEY and key % 1 == 0):  # type: ignore[operator]
+        if not (isinstance(key, numbers.Real) and 0 <= key < MAX_KEY and key % 1 == 0):  # type: ignore[operator]
             raise ValueError(
                 f"noise_keys[{index}] = {key!r}: must be a whole number from 0 to 2**53 - 1, so"
                 " that a float64 holds it exactly"
@@ -292,7 +292,7 @@ def _loop_radius(
     ]
 
     def linearized(number: int, timestep: float, size: float = 1.0) -> np.ndarray:
-        change = size * stability.CHANGE
+        change = size * stability.PERTURBATION
         return stability.linearize(
             motors[number], advances[number], timestep, known_inertias[number], change
         )
@@ -395,7 +395,7 @@ class Readout:
         out, instances = model.actuator_outadr[indices], model.actuator_plugin[indices]
         uses_plugin, tracks = (
             instances >= 0,
-            np.array([family.tracks for family in families], dtype=bool),
+            np.array([family.is_torque_controlled for family in families], dtype=bool),
         )
         self._plugin_use = uses_plugin.all(), uses_plugin.any()
         # Indices count in the vector of `table`: activations, plugin states, or, if the model has

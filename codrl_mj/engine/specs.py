@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, JointAdditions, reference, resolve
+from codrl_mj.actuators import ActuatorModel, JointAdditions, import_path, resolve
 from codrl_mj.engine.families import load_family, user_header
 from codrl_mj.engine.reading import check_shafts
 from codrl_mj.fields import check_joint_dynamics, check_pattern, did_you_mean
@@ -363,11 +363,15 @@ def _add_motor(spec: mujoco.MjSpec, model: mujoco.MjModel, added: AddedMotor) ->
     """
     actuator, index, instance = added.actuator, added.indices[0], f"{NAME}.{added.indices[0]}"
     spec.activate_plugin(NAME)
-    spec.add_plugin(name=instance, plugin_name=NAME).config = {FAMILY: reference(type(actuator))}
+    spec.add_plugin(name=instance, plugin_name=NAME).config = {FAMILY: import_path(type(actuator))}
     for partner in added.indices:
         _connect(spec, model, partner, instance, actuator.MOTION)
     target, additions = spec.actuators[index], actuator.additions
-    target.userdata = [*user_header(type(actuator)), actuator.arm_radius, *actuator.numbers]
+    target.userdata = [
+        *user_header(type(actuator)),
+        actuator.arm_radius,
+        *actuator.parameter_values,
+    ]
     target.armature += additions.armature
     target.damping[0] += additions.damping
     if additions.friction:

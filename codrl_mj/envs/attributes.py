@@ -15,7 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from codrl_mj.disturbances import OFF
+from codrl_mj.disturbances import NO_DISTURBANCES
 from codrl_mj.envs.setup import ResolvedEnv
 from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.variation import Variation, field_of, write_fields
@@ -168,7 +168,11 @@ def _write_number(
 def _write_forces(value: Any, setup: ResolvedEnv, model: Any, per_action: bool) -> ResolvedEnv:
     """Write the force of each action, or the largest force, to which the others are scaled."""
     task = setup.task
-    if setup.config.action != "force" or setup.config.disturbances != OFF or len(task.motors) > 1:
+    if (
+        setup.config.action != "force"
+        or setup.config.disturbances != NO_DISTURBANCES
+        or len(task.motors) > 1
+    ):
         raise AttributeError(
             "the current loop's table, the drive's disturbances and several motors depend on the"
             " forces: make an environment of one motor with action='force' and no disturbances"
@@ -192,7 +196,7 @@ def _write_forces(value: Any, setup: ResolvedEnv, model: Any, per_action: bool) 
 def _write_step(value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
     """Write the duration of an environment step [s]; the number of inner steps stays."""
     duration = _finite_number(value, positive=True)
-    if setup.simulation.motors_added or setup.config.disturbances != OFF:
+    if setup.simulation.motors_added or setup.config.disturbances != NO_DISTURBANCES:
         raise AttributeError(
             "motor and disturbances were checked for this step: make an environment without them"
         )

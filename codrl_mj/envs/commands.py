@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Drive, Ideal, Servo
-from codrl_mj.disturbances import OFF, Disturbances, check_delay
+from codrl_mj.disturbances import NO_DISTURBANCES, Disturbances, check_delay
 from codrl_mj.engine.reading import actuators_sharing_motor
 from codrl_mj.engine.reading import motors as motors_of
 from codrl_mj.engine.specs import ON_JOINT
@@ -93,7 +93,7 @@ class TaskCommands:
             )
         self.simulated = tuple(command.actuator for command in chosen)
         """Actuator to simulate for each motor; a command may bypass a part of it."""
-        self.is_torque_controlled = self.simulated[0].tracks
+        self.is_torque_controlled = self.simulated[0].is_torque_controlled
         """True if the command is a torque. If False, `desired_force` equals the delivered force."""
         self.fixed = chosen[0].fixed
         """Fields of the actuator that cannot be randomized -> reason."""
@@ -104,7 +104,7 @@ class TaskCommands:
         if not all(limit is None or np.isfinite(limit) for limit in limits):
             raise ValueError(f"action = {name!r}: needs a finite controller.max_voltage, it is inf")
         self.holds = np.where([command.unit in POSITIONS for command in chosen], scales, 0.0)
-        """As `codrl_mj.physics.SimulationConfig.holds`."""
+        """As `codrl_mj.physics.SimulationConfig.force_per_position`."""
         motors = zip(limits, scales, task.max_forces, strict=True)
         self.max_forces = np.array(
             [max_force if limit is None else limit * scale for limit, scale, max_force in motors]
@@ -246,7 +246,7 @@ class ControlCommands:
         """
         self.action_space, model, indices = actions, data.model, list(motors)
         self._scales: np.ndarray | None = None
-        self._disturber, self._dofs = Disturber(OFF, 1.0, np.zeros(0), 1), list[int]()
+        self._disturber, self._dofs = Disturber(NO_DISTURBANCES, 1.0, np.zeros(0), 1), list[int]()
         commands_by_index = {
             index: command for index, command in motors.items() if command is not None
         }
@@ -256,7 +256,9 @@ class ControlCommands:
             else {}
         )
         remedies |= (
-            {} if disturbances == OFF else {"disturbances": "only such controls can be disturbed"}
+            {}
+            if disturbances == NO_DISTURBANCES
+            else {"disturbances": "only such controls can be disturbed"}
         )
         for name, remedy in remedies.items():
             if not isinstance(actions, spaces.Box) or actions.shape != (model.nu,):
@@ -266,7 +268,7 @@ class ControlCommands:
                 )
         if commands_by_index:
             self._command(model, commands_by_index)
-        if disturbances == OFF:
+        if disturbances == NO_DISTURBANCES:
             return
         if step_duration is None:
             raise ValueError(
@@ -346,11 +348,11 @@ class ControlCommands:
     @property
     def memory(self) -> dict[str, np.ndarray]:
         """Live array of delayed commands and scheduled pulses; no entry without disturbances."""
-        return {"disturbances": self._disturber.memory} if self._disturber.on else {}
+        return {"disturbances": self._disturber.memory} if self._disturber.enabled else {}
 
     def begin(self, key: float) -> None:
         """Reset at the start of an episode that has this key of random numbers."""
-        if self._disturber.on:
+        if self._disturber.enabled:
             self._disturber.reset(np.zeros(1, dtype=int), key, self._holding_commands())
             self._data.qfrc_applied[self._dofs] = 0.0
 
@@ -367,7 +369,7 @@ class ControlCommands:
 
     def controls(self, action: Any) -> Any:
         """Return the environment's action after scaling and disturbances; apply loads to joints."""
-        if (self._scales is not None or self._disturber.on) and np.shape(
+        if (self._scales is not None or self._disturber.enabled) and np.shape(
             action
         ) != self.action_space.shape:
             raise ValueError(
@@ -375,12 +377,12 @@ class ControlCommands:
             )
         if self._scales is not None:
             action = np.asarray(action, dtype=np.float64) * self._scales
-        if not self._disturber.on:
+        if not self._disturber.enabled:
             return action
         delayed_action = np.array(action, dtype=np.float64)
         commanded_forces = delayed_action[self._controls] * self._gains
         commands, loads = (
-            array[0] for array in self._disturber.disturbed(commanded_forces[np.newaxis])
+            array[0] for array in self._disturber.disturb_commands(commanded_forces[np.newaxis])
         )
         delayed_action[self._controls] = commands / self._gains
         if self._pulses:

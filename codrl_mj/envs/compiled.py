@@ -31,14 +31,14 @@ import numba
 import numpy as np
 from numba import types
 
-from codrl_mj.actuators.noise import LARGEST_KEY
+from codrl_mj.actuators.noise import MAX_KEY
 from codrl_mj.compile_cache import njit
 from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import f32, f64, i64, internal, stack_floats, to_floats
 from codrl_mj.envs.setup import FIRST_OPTION, NEEDS_KEY, ResolvedEnv
 from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
 from codrl_mj.physics.rows import Lane, Rows, load, store
-from codrl_mj.physics.sharing import shared
+from codrl_mj.physics.sharing import make_shared_kernel
 from codrl_mj.physics.stepping import OBSERVATION, OPTIONS, Stepping, simulation_at
 
 
@@ -129,18 +129,18 @@ def compiled_env(env: Any) -> CompiledEnv | None:
 
 def bind_observation(setup: ResolvedEnv, physics: Any) -> tuple[int, np.ndarray]:
     """Connect a simulation to its observation array; return the table's address and the array."""
-    _, observation = physics.bound or (
+    _, observation = physics.bound_arrays or (
         None,
         np.empty(setup.observation_space.shape or (), np.float32),
     )
     # Both arrays must stay alive as long as compiled code may use their addresses, so the physics
     # holds references to them.
-    physics.bound = options, observation = setup.options, observation
-    physics.places[OPTIONS], physics.places[OBSERVATION] = (
+    physics.bound_arrays = options, observation = setup.options, observation
+    physics.pointer_table[OPTIONS], physics.pointer_table[OBSERVATION] = (
         options.ctypes.data,
         observation.ctypes.data,
     )
-    return physics.where, observation
+    return physics.pointers, observation
 
 
 def compiled_kernels(setup: ResolvedEnv, physics: Any) -> Kernels:
@@ -213,11 +213,7 @@ def _kernels(
             state[entry] = entries[entry]
         # A number is drawn only if a key is needed: otherwise the next episodes would not start in
         # the states in which Gymnasium's environment starts them with the same seed.
-        key = (
-            generator.random() * LARGEST_KEY
-            if f64(i64(pointers)[OPTIONS])[NEEDS_KEY] != 0.0
-            else 0.0
-        )
+        key = generator.random() * MAX_KEY if f64(i64(pointers)[OPTIONS])[NEEDS_KEY] != 0.0 else 0.0
         start(state, key, pointers)
         observe_row(np.zeros(simulation_at(pointers)[4].shape[1:]), state, pointers)
 
@@ -231,11 +227,11 @@ def _kernels(
             steps.signals,
             steps.elapsed,
         )
-        pointers, last = lane.places.ctypes.data, lane.trace[len(lane.trace) - 1]
-        lane.places[OPTIONS] = steps.options.ctypes.data
+        pointers, last = lane.pointer_table.ctypes.data, lane.trace[len(lane.trace) - 1]
+        lane.pointer_table[OPTIONS] = steps.options.ctypes.data
         for row in range(first, end):
             load(rows, row, lane)
-            lane.places[OBSERVATION] = observations[row].ctypes.data
+            lane.pointer_table[OBSERVATION] = observations[row].ctypes.data
             reward, terminated, is_finite = step(steps.forces[row], pointers)
             store(rows, row, lane)
             elapsed[row] += 1
@@ -254,7 +250,7 @@ def _kernels(
         no_signals, state = np.zeros(lane.trace.shape[1:]), np.empty(size)
         for row in indices:
             load(rows, row, lane)
-            lane.places[OBSERVATION] = observations[row].ctypes.data
-            observe_row(no_signals, state, lane.places.ctypes.data)
+            lane.pointer_table[OBSERVATION] = observations[row].ctypes.data
+            observe_row(no_signals, state, lane.pointer_table.ctypes.data)
 
-    return Kernels(step, reset, shared(step_range), observe_rows)
+    return Kernels(step, reset, make_shared_kernel(step_range), observe_rows)

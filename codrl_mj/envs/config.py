@@ -12,8 +12,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, mapping_of, names_together
-from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve
+from codrl_mj.actuators import ActuatorModel, combined_name, mapping_of
+from codrl_mj.disturbances import NO_DISTURBANCES, UNMODIFIED_JOINT, Disturbances, Joint, resolve
 from codrl_mj.envs.distributions import Distribution, parse_randomize
 from codrl_mj.envs.sources import EnvSource, find_source, options_mapping
 from codrl_mj.fields import check_joint_dynamics, check_names
@@ -66,9 +66,9 @@ class EnvConfig:
     """Time limit [environment steps], >= 1; default: the environment's own."""
     allow_unstable: bool = False
     """Build the environment even if the current loop is unstable."""
-    disturbances: Disturbances = OFF
+    disturbances: Disturbances = NO_DISTURBANCES
     """Imperfections of the command path, and load pulses; each is off at 0."""
-    joint: Joint = PLAIN
+    joint: Joint = UNMODIFIED_JOINT
     """Damping, friction and armature that are added to the actuated joints."""
     joint_dynamics: str | None = None
     """Treatment of damping, armature and frictionloss in a third-party model whose motors add the
@@ -96,8 +96,8 @@ class EnvConfig:
             field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)
         }
         source = find_source(values["task"])
-        values |= {"task": source.reference, "joint": resolve(values["joint"], PLAIN)}
-        values["disturbances"] = resolve(values["disturbances"], OFF)
+        values |= {"task": source.reference, "joint": resolve(values["joint"], UNMODIFIED_JOINT)}
+        values["disturbances"] = resolve(values["disturbances"], NO_DISTURBANCES)
         for field in dataclasses.fields(self):
             if field.name not in source.fields and values[field.name] != field.default:
                 raise ValueError(
@@ -184,7 +184,7 @@ class EnvConfig:
     @property
     def actuator_label(self) -> str:
         """Display name of the actuators."""
-        return names_together(self.actuators, self.source.paper)
+        return combined_name(self.actuators, self.source.paper)
 
     @property
     def distributions(self) -> dict[str, Distribution]:
@@ -222,7 +222,7 @@ class EnvConfig:
         set_arguments = {
             name: value
             for name, value in arguments.items()
-            if value is not None and value not in (OFF, PLAIN)
+            if value is not None and value not in (NO_DISTURBANCES, UNMODIFIED_JOINT)
         }
         return set_arguments | self.source.changed(self.options)
 

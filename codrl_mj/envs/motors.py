@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Family, Inputs, parameters_type
-from codrl_mj.actuators.noise import LARGEST_KEY
-from codrl_mj.disturbances import OFF, Disturbances
+from codrl_mj.actuators.noise import MAX_KEY
+from codrl_mj.disturbances import NO_DISTURBANCES, Disturbances
 from codrl_mj.engine.families import USER_HEADER_SIZE, signals_offset
 from codrl_mj.engine.reading import Readout, actuators_sharing_motor, bring_to_rest, motor_slots
 from codrl_mj.engine.specs import match_pattern, matchable_names
@@ -23,7 +23,7 @@ from codrl_mj.envs.randomization import (
     apply_to_simulation,
     check_extremes,
 )
-from codrl_mj.physics.base import diverged, make_info_reader
+from codrl_mj.physics.base import divergence_error, make_info_reader
 from codrl_mj.physics.variation import without_motors, write_fields
 
 # MuJoCo's warnings of speeds, accelerations and controls follow that of positions in this order.
@@ -42,7 +42,7 @@ class MotorSettings:
     """True to append the values of the motors' sensors to observations."""
     randomize: Any = None
     """Distributions of the fields that are drawn at every reset."""
-    disturbances: Disturbances = OFF
+    disturbances: Disturbances = NO_DISTURBANCES
     """Disturbances of commands, and load pulses."""
     allow_unstable: bool = False
     """See `codrl_mj.add_motors`."""
@@ -143,7 +143,7 @@ class ActuatorBank:
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the motors for others of their families; a reset must follow."""
         for index, actuator in zip(self.motors, actuators, strict=True):
-            values = (actuator.arm_radius, *actuator.numbers)
+            values = (actuator.arm_radius, *actuator.parameter_values)
             self.data.model.actuator_user[
                 index, USER_HEADER_SIZE : USER_HEADER_SIZE + len(values)
             ] = values
@@ -161,7 +161,7 @@ class ActuatorBank:
         self.data.warning.number[:] = 0
         # The product is exactly an integer: numpy draws multiples of 2**-53, and the largest key
         # is 2**53.
-        key = generator.random() * LARGEST_KEY if self._random else 0.0
+        key = generator.random() * MAX_KEY if self._random else 0.0
         for motor_index, (slot, motor) in enumerate(
             zip(self._slots, self.motors.values(), strict=True)
         ):
@@ -207,7 +207,7 @@ class ActuatorBank:
             )
             quantity = {_POSITION: "position", _POSITION + 1: "speed"}.get(kind, "acceleration")
             subject = f"the {quantity} of {model.joint(joint).name or f'joint {joint}'}"
-        raise diverged(
+        raise divergence_error(
             name,
             time,
             f"{subject} is not finite, or too large",
@@ -275,4 +275,4 @@ def extend_space(space: spaces.Space, count: int) -> spaces.Box:
 def _parameters(motor: ActuatorModel) -> Any:
     """Return a motor's parameters as the family's named tuple."""
     family: Family = type(motor)
-    return parameters_type(family)(*motor.numbers)
+    return parameters_type(family)(*motor.parameter_values)

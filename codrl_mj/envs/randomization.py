@@ -26,7 +26,13 @@ from codrl_mj.engine.reading import actuators_sharing_motor, check_shafts
 from codrl_mj.engine.specs import match_pattern, matchable_names
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
 from codrl_mj.fields import did_you_mean
-from codrl_mj.physics.variation import Variation, mounting_of, mounts_of, variable, write_fields
+from codrl_mj.physics.variation import (
+    Variation,
+    arms_and_additions,
+    joint_addresses,
+    variable_names,
+    write_fields,
+)
 
 MAX_CORNERS = 32
 """Maximum number of combinations of bounds to check: all of five fields, a sample of more."""
@@ -105,7 +111,9 @@ class Randomization:
         self.model_paths = (*model_only_paths, *paths_of_additions)
         """Paths that change the model itself, and not only parameters of its motors."""
         self.variation = (
-            Variation(model, model_only_paths, list(motors), mounting=bool(paths_of_additions))
+            Variation(
+                model, model_only_paths, list(motors), vary_additions=bool(paths_of_additions)
+            )
             if self.model_paths
             else None
         )
@@ -144,7 +152,7 @@ class RandomizationState:
             np.array(list(map(field_values, fields))) for fields in zip(*motors, strict=True)
         ]
         """Fields of each motor, shape (N, f), columns as in `field_paths`."""
-        self._mounting = mounting_of(motors)
+        self._mounting = arms_and_additions(motors)
         self._values = np.full((len(motors), len(randomization.distributions)), np.nan)
         self._rejected = np.zeros(len(motors), dtype=np.int64)
 
@@ -208,7 +216,7 @@ class RandomizationState:
             randomization.families, self._fields(row, values), strict=True
         ):
             try:
-                family.from_numbers(parameters_from_fields(family, motor_fields)[0]).check(
+                family.from_parameter_values(parameters_from_fields(family, motor_fields)[0]).check(
                     randomization.timestep
                 )
             except ValueError as error:
@@ -253,7 +261,7 @@ class RandomizationState:
         arms, additions = (array[rows] for array in self._mounting)
         if self.randomization.changes_mounting:
             simulations = zip(*(motor_fields.tolist() for motor_fields in fields), strict=True)
-            arms, additions = mounting_of(
+            arms, additions = arms_and_additions(
                 [list(map(from_array, families, values)) for values in simulations]
             )
         return list(map(parameters_from_fields, families, fields)), arms, additions
@@ -409,11 +417,11 @@ def _match_motors(
     indices, actuators, model_fields = (
         list(motors),
         list(motors.values()),
-        variable(model) if distributions else (),
+        variable_names(model) if distributions else (),
     )
     names, allows_friction = (
         matchable_names(model),
-        [mounts_of(model, index)[2] is not None for index in motors],
+        [joint_addresses(model, index)[2] is not None for index in motors],
     )
     actuator_names = [
         [name for actuator in actuators_sharing_motor(model, index) for name in names[actuator]]

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
-from codrl_mj.actuators.noise import LARGEST_KEY
+from codrl_mj.actuators.noise import MAX_KEY
 from codrl_mj.disturbances import check_delay
 from codrl_mj.engine.reading import check_shafts
 from codrl_mj.envs.commands import TaskCommands
@@ -161,7 +161,7 @@ class ResolvedEnv:
         if not self.random:
             return np.zeros(1)
         # The product is exactly an integer: draws are multiples of 2**-53, the factor is 2**53.
-        return random(1)[:, 0] * LARGEST_KEY
+        return random(1)[:, 0] * MAX_KEY
 
     # -- observations and rewards of the agent --------------------------------------------
 
@@ -198,7 +198,7 @@ class ResolvedEnv:
         self._outcomes[0].observe(np.ascontiguousarray(physics.state), observation)
         if self.sensors:
             row = np.zeros_like(physics.trace[-1]) if row is None else row
-            observation[size:] = physics.observed(row).reshape(-1)
+            observation[size:] = physics.read_sensors(row).reshape(-1)
         return observation
 
     def outcome(self, before: np.ndarray, force: Any, after: np.ndarray) -> tuple[float, bool]:

@@ -16,7 +16,7 @@ from codrl_mj.envs.setup import ResolvedEnv, unwrap_single
 from codrl_mj.envs.snapshots import check_snapshot, encode_name, generator_from_words
 from codrl_mj.physics import MujocoPhysics, SimulationConfig, signal_names, trace_names
 from codrl_mj.physics.offscreen import OffscreenRenderer, Window, check_view
-from codrl_mj.physics.streams import words_of
+from codrl_mj.physics.streams import generator_words
 from codrl_mj.tasks import Task
 
 
@@ -267,7 +267,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         state = {
             "task": encode_name(self.task.name),
             "physics": self.physics.snapshot(),
-            "generator": words_of(self.np_random),
+            "generator": generator_words(self.np_random),
         }
         if self.physics.memory.size:
             state["disturbances"] = self.physics.memory.copy()

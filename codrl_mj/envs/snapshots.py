@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from mujoco.introspect.structs import STRUCTS
 
-from codrl_mj.physics.streams import set_words
+from codrl_mj.physics.streams import set_generator_words
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
@@ -44,9 +44,9 @@ def encode_name(name: str) -> np.ndarray:
 
 
 def generator_from_words(words: np.ndarray) -> np.random.Generator:
-    """Create a generator with the state that `codrl_mj.physics.streams.words_of` returned."""
+    """Create a generator with the state that `codrl_mj.physics.streams.generator_words` returned."""
     generator, _ = seeding.np_random(0)
-    set_words(generator, words)
+    set_generator_words(generator, words)
     return generator
 
 

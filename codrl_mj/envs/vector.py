@@ -19,7 +19,7 @@ from codrl_mj.physics import Signals
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import Streams
-from codrl_mj.physics.variation import SHOWN, VARIED, field_of, write_fields
+from codrl_mj.physics.variation import DYNAMIC_FIELDS, VISUAL_FIELDS, field_of, write_fields
 from codrl_mj.tasks import Task
 
 Array = np.ndarray
@@ -191,13 +191,15 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
                 f"{name} = {value!r}: must be one number, or {self.num_envs}, one for each"
                 " environment"
             )
-        fields = {field: self.physics.field(field).copy() for field in VARIED}
+        fields = {field: self.physics.field(field).copy() for field in DYNAMIC_FIELDS}
         visual_fields = {
             field: np.array([field_of(self.physics.model, field)] * self.num_envs)
-            for field in SHOWN
+            for field in VISUAL_FIELDS
         }
         visual_fields |= {
-            field: rows.copy() for field, rows in self.model_fields.items() if field in SHOWN
+            field: rows.copy()
+            for field, rows in self.model_fields.items()
+            if field in VISUAL_FIELDS
         }
         values = np.broadcast_to(value, self.num_envs).tolist()
         for row, (model, env_value) in enumerate(zip(self.physics.models(), values, strict=True)):

@@ -1,4 +1,4 @@
-"""Whole episodes, and what they are reduced to."""
+"""Whole episodes, and their reduction to measures."""
 
 from codrl_mj.evaluation.episodes import (
     Episode,

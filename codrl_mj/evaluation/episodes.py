@@ -1,4 +1,4 @@
-"""Whole episodes: running them, and keeping them in files."""
+"""Whole episodes: running, saving and loading them."""
 
 import contextlib
 import copy
@@ -17,7 +17,7 @@ from gymnasium import spaces
 from codrl_mj.actuators import IDEAL, actuator_from_mapping, allow_imports, mapping_of
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import check_memory
-from codrl_mj.runs.files import below, writing
+from codrl_mj.runs.files import atomic_write, select_prefix
 from codrl_mj.runs.policies import Policy
 
 MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
@@ -25,54 +25,57 @@ MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
 
 @dataclasses.dataclass(frozen=True)
 class Episode:
-    """Everything that happened in one episode of T environment steps of n integration steps each."""
+    """Recording of one episode of T environment steps with n integration steps each."""
 
     time: np.ndarray
     """Time at the end of each step [s], shape (T,)."""
     state: np.ndarray
     """Mechanical state before the first step and after each, shape (T+1, k)."""
     observation: np.ndarray
-    """What the agent saw, before the first step and after each, shape (T+1, ...)."""
+    """Observation before the first step and after each, shape (T+1, ...)."""
     action: np.ndarray
-    """What the agent did, shape (T, ...)."""
+    """Action of each step, shape (T, ...)."""
     reward: np.ndarray
     """Reward of each step, shape (T,)."""
     first_speeds: np.ndarray
-    """Velocities at the motors' side of the model's gears before the first step [m/s or rad/s], shape (motors,)."""
+    """Velocities on the motor side of the model's gears before the first step, shape (motors,).
+
+    The unit is m/s or rad/s.
+    """
     trace: dict[str, np.ndarray]
-    """What the actuators did in each integration step, by the names of
+    """Signals of the actuators in each integration step, by the names of
     `codrl_mj.physics.trace_names`, each of shape (T*n,); with several motors (T*n, motors).
     """
     signals: dict[str, np.ndarray]
-    """The actuators' signals at the end of each step, by their names in `info`, each of shape (T,) or (T, motors)."""
+    """Signals of the actuators at the end of each step, by name in `info`: (T,) or (T, motors)."""
     terminated: bool
-    """The task ended it; otherwise the time limit did."""
+    """True if the task ended the episode. If False, the time limit did."""
     actuator: Any
-    """What it ran on: the one that was drawn for it, if actuators were; with several motors a tuple of them."""
+    """Actuator of the episode, after randomization; with several motors a tuple."""
     command: str = "force"
-    """What the agent commanded: `force`, `current` or `voltage`."""
+    """Quantity that the agent commands: `force`, `current` or `voltage`."""
     motors: tuple[str, ...] = ()
-    """Names of several motors."""
+    """Names of the motors; empty for a single one."""
     succeeded: bool | None = None
-    """What the environment said of it in the end (`is_success` or `success` in its info), if anything."""
+    """Final `is_success` or `success` in `info`; None if the environment has neither."""
 
     @property
     def actuators(self) -> tuple[Any, ...]:
-        """What it ran on, always as a tuple."""
+        """Actuators of the episode, always as a tuple."""
         return self.actuator if isinstance(self.actuator, tuple) else (self.actuator,)
 
     @property
-    def tracks(self) -> tuple[bool, ...]:
-        """For each motor True if a torque was asked of it; a voltage, a position or a speed is none."""
-        asked = (
-            one if self.command == "force" else one.commands()[self.command].actuator
-            for one in self.actuators
+    def is_torque_controlled(self) -> tuple[bool, ...]:
+        """For each motor, True if its command is a torque, not a voltage, position or speed."""
+        command_actuators = (
+            actuator if self.command == "force" else actuator.commands()[self.command].actuator
+            for actuator in self.actuators
         )
-        return tuple(one.tracks for one in asked)
+        return tuple(actuator.is_torque_controlled for actuator in command_actuators)
 
     @property
     def total(self) -> float:
-        """The return: the sum of the rewards."""
+        """Return of the episode: the sum of its rewards."""
         return float(self.reward.sum())
 
     @property
@@ -87,14 +90,14 @@ class Episode:
 
 
 class RandomPolicy:
-    """Chooses uniformly from an action space."""
+    """Policy that samples uniformly from an action space."""
 
     def __init__(self, actions: str | spaces.Space[Any], seed: int = 0) -> None:
         """Seed a private copy of the action space.
 
         Args:
-            actions: the space, or the name of the task whose space it is.
-            seed: of the choices.
+            actions: the space, or the name of a task.
+            seed: seed of the samples.
 
         Raises:
             ValueError: unknown task, or a seed below 0.
@@ -110,9 +113,9 @@ class RandomPolicy:
         self,
         observation: np.ndarray,
         *,
-        deterministic: bool = False,  # noqa: ARG002 - the protocol's
+        deterministic: bool = False,  # noqa: ARG002 - required by the Policy protocol
     ) -> tuple[np.ndarray, Any]:
-        """One random action for each observation; `deterministic` makes no difference."""
+        """Return one random action for each observation; `deterministic` is ignored."""
         return np.array([self._space.sample() for _ in observation]), None
 
 
@@ -120,16 +123,16 @@ _ARRAYS = ("time", "state", "observation", "action", "reward", "first_speeds")
 
 
 def save_episode(episode: Episode, path: Path) -> None:
-    """Write an episode as a compressed NumPy archive, whole or not at all.
+    """Write an episode atomically as a compressed NumPy archive.
 
     Args:
         episode: the episode.
-        path: `.npz` file; its arrays are named as the fields of `Episode`, what is in `trace` and
-            `signals` as `trace/NAME` and `signals/NAME`. `actuator` is text: its fields as JSON, a
-            list for several motors.
+        path: `.npz` file. Its arrays have the names of the fields of `Episode`, and `trace/NAME`
+            and `signals/NAME` for the entries of `trace` and `signals`. `actuator` is a text: its
+            fields as JSON, or a list for several motors.
 
     Raises:
-        ValueError: another suffix.
+        ValueError: the suffix is not .npz.
     """
     if path.suffix != ".npz":
         raise ValueError(f"trajectory {path}: the suffix must be .npz")
@@ -142,41 +145,43 @@ def save_episode(episode: Episode, path: Path) -> None:
         arrays["motors"] = episode.motors
     if episode.succeeded is not None:
         arrays["succeeded"] = episode.succeeded
-    several = isinstance(episode.actuator, tuple)
-    described = (
-        [mapping_of(one) for one in episode.actuator] if several else mapping_of(episode.actuator)
+    has_several = isinstance(episode.actuator, tuple)
+    descriptions = (
+        [mapping_of(actuator) for actuator in episode.actuator]
+        if has_several
+        else mapping_of(episode.actuator)
     )
-    with writing(path) as temporary:
-        np.savez_compressed(temporary, actuator=json.dumps(described), **arrays)
+    with atomic_write(path) as temporary:
+        np.savez_compressed(temporary, actuator=json.dumps(descriptions), **arrays)
 
 
 def load_episode(path: Path, trust: bool = False) -> Episode:
-    """Read an episode that `save_episode` wrote; nothing is unpickled.
+    """Read an episode written by `save_episode`, without unpickling.
 
     Args:
         path: the file.
-        trust: whether to import the module of an actuator that is none of ours, which executes it.
+        trust: whether to import the module of a custom actuator, which executes it.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is not such an archive.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is not an archive of an episode.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        described = json.loads(str(arrays["actuator"]))
-        several = isinstance(described, list)
+        descriptions = json.loads(str(arrays["actuator"]))
+        has_several = isinstance(descriptions, list)
         with allow_imports(trust):
             actuators = [
-                IDEAL if one is None else actuator_from_mapping(one)
-                for one in (described if several else [described])
+                IDEAL if description is None else actuator_from_mapping(description)
+                for description in (descriptions if has_several else [descriptions])
             ]
         return Episode(
             **{field: arrays[field] for field in _ARRAYS},
-            trace=below("trace/", arrays),
-            signals=below("signals/", arrays),
+            trace=select_prefix("trace/", arrays),
+            signals=select_prefix("signals/", arrays),
             terminated=bool(arrays["terminated"]),
-            actuator=tuple(actuators) if several else actuators[0],
+            actuator=tuple(actuators) if has_several else actuators[0],
             command=str(arrays["command"]),
             motors=tuple(arrays["motors"].tolist()) if "motors" in arrays else (),
             succeeded=bool(arrays["succeeded"]) if "succeeded" in arrays else None,
@@ -193,13 +198,14 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
         raise ValueError(f"{path} is not the trajectory of an episode: {error}") from None
 
 
-# memory [bytes] of an environment that stands still; the tasks' have three to seven times that
+# Memory [bytes] of the smallest environment; those of the built-in tasks take three to seven times
+# as much.
 _EPISODE_SIZE = 100_000
 _STEPS_BETWEEN_CHECKS = 10_000
 
 
 def check_episodes(episodes: int, name: str = "episodes") -> None:
-    """Refuse a number of episodes that is below 1, or whose environments memory does not hold."""
+    """Raise if the number of episodes is below 1 or their environments do not fit into memory."""
     if episodes < 1:
         raise ValueError(f"{name} = {episodes}: must be >= 1")
     check_memory(
@@ -208,7 +214,7 @@ def check_episodes(episodes: int, name: str = "episodes") -> None:
 
 
 class _Recording:
-    """One environment, and what has happened in it since the reset."""
+    """Environment with a recording since its reset."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], seed: int) -> None:
         """Reset the environment."""
@@ -224,7 +230,7 @@ class _Recording:
         self._terminated = False
 
     def step(self, action: Any) -> bool:
-        """Take a step, and say whether the episode has ended."""
+        """Take a step; return True if the episode has ended."""
         observation, reward, self._terminated, truncated, info = self.env.step(action)
         self.observations.append(observation)
         self._states.append(self._recorder.state)
@@ -232,19 +238,18 @@ class _Recording:
         self._rewards.append(float(reward))
         self._traces.append(self._recorder.trace)
         self._signals.append(info)
-        if (
-            steps := len(self._traces)
-        ) % _STEPS_BETWEEN_CHECKS == 0:  # what is recorded is copied in the end
-            what = f"an episode of {steps:,} steps, which does not end"
-            check_memory(steps * self._traces[-1].nbytes, what, "lower max_episode_steps")
+        # The recording is concatenated at the end, which needs its size again.
+        if (steps := len(self._traces)) % _STEPS_BETWEEN_CHECKS == 0:
+            label = f"an episode of {steps:,} steps, which does not end"
+            check_memory(steps * self._traces[-1].nbytes, label, "lower max_episode_steps")
         return self._terminated or truncated
 
     def episode(self) -> Episode:
-        """What has happened."""
+        """Return the recording as an `Episode`."""
         recorder = self._recorder
-        said = self._signals[-1].get("is_success", self._signals[-1].get("success"))
-        whole = np.concatenate(self._traces)
-        columns = whole[:, 0].T if whole.shape[1] == 1 else np.moveaxis(whole, 2, 0)
+        success = self._signals[-1].get("is_success", self._signals[-1].get("success"))
+        trace = np.concatenate(self._traces)
+        columns = trace[:, 0].T if trace.shape[1] == 1 else np.moveaxis(trace, 2, 0)
         return Episode(
             time=recorder.step_duration * np.arange(1, len(self._rewards) + 1),
             state=np.array(self._states),
@@ -261,7 +266,7 @@ class _Recording:
             command=recorder.command,
             motors=recorder.motor_names if len(recorder.motor_names) > 1 else (),
             first_speeds=self._first_speeds,
-            succeeded=None if said is None else bool(said),
+            succeeded=None if success is None else bool(success),
         )
 
 
@@ -273,14 +278,14 @@ def run_episodes(
     deterministic: bool = True,
     on_step: Callable[[int, int], None] | None = None,
 ) -> list[Episode]:
-    """Run whole episodes side by side, the policy choosing for all of them at once.
+    """Run whole episodes side by side, with one call of the policy per step for all of them.
 
     Args:
-        policy: chooses actions for a batch of observations.
-        make: makes one environment with a time limit.
-        episodes: their number, >= 1; episode i starts from seed `seed + i`.
-        seed: first seed; also of the actions that a policy samples from torch's generator.
-        deterministic: whether the policy takes its most likely action or samples.
+        policy: policy that chooses actions for a batch of observations.
+        make: function that makes one environment with a time limit.
+        episodes: number of episodes, >= 1; episode i starts from seed `seed + i`.
+        seed: first seed, and seed of torch's generator for sampled actions.
+        deterministic: True for the most likely action, False for a sampled one.
         on_step: called with (episodes running, episodes finished) after every step.
 
     Returns:
@@ -288,7 +293,7 @@ def run_episodes(
 
     Raises:
         ValueError: `episodes` is below 1, or `seed` below 0.
-        SimulationDivergedError: a simulation left the finite numbers.
+        SimulationDivergedError: a simulation has a value that is not finite.
     """
     check_episodes(episodes)
     if seed < 0:
@@ -296,9 +301,9 @@ def run_episodes(
     recordings = [_Recording(make(), seed + index) for index in range(episodes)]
     running = recordings
     with contextlib.ExitStack() as stack:
-        if (
-            not deterministic
-        ):  # the generator that torch's policies sample from is left as it was found
+        # Stochastic policies sample from torch's global generator, whose state is restored
+        # afterwards.
+        if not deterministic:
             import torch
 
             stack.enter_context(torch.random.fork_rng(devices=[]))
@@ -311,7 +316,9 @@ def run_episodes(
             ]
             if any(ended):
                 running = [
-                    recording for recording, over in zip(running, ended, strict=True) if not over
+                    recording
+                    for recording, has_ended in zip(running, ended, strict=True)
+                    if not has_ended
                 ]
             if on_step is not None:
                 on_step(len(running), episodes - len(running))

@@ -1,4 +1,4 @@
-"""How well a policy does on an actuator, and what that asks of the motor. docs/evaluation.md has every formula."""
+"""Measures of a policy on an actuator and of the motor's load; formulas: docs/evaluation.md."""
 
 import dataclasses
 import math
@@ -34,18 +34,18 @@ def _measure(label: str, unit: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """What a policy achieved on an actuator, over all integration steps of all episodes.
+    """Measures of a policy on an actuator, over all integration steps of all episodes.
 
-    Torques, speeds and currents are the motor's own, at its shaft. Electrical measures are None for
+    Torques, speeds and currents refer to the motor's shaft. Electrical measures are None for
     the ideal actuator, which has no motor.
     """
 
     task: str
-    """The task's name."""
+    """Name of the task."""
     episodes: int
     """Number of episodes."""
     terminated: int
-    """How many of them the task ended; the time limit ended the others."""
+    """Number of episodes that the task ended; the time limit ended the others."""
     returns: Interval = _measure("return", "reward")
     """Return: the sum of an episode's rewards."""
     returns_median: float = _measure("return, median", "reward")
@@ -55,38 +55,37 @@ class Evaluation:
     length: Interval = _measure("length", "steps")
     """Environment steps per episode."""
     success: Interval | None = _measure("success", "share")
-    """Share of episodes that succeed, as the task defines it, or as an environment of others says
-    in its `info`; None where it says nothing. Wilson's interval.
+    """Share of successful episodes, as defined by the task or by the `info` of a third-party
+    environment; None if neither defines it. Wilson's interval.
     """
     failure: Interval | None = _measure("failure", "share")
-    """Share of episodes that do not."""
+    """Share of episodes that do not succeed."""
     time_to_goal: Quartiles | None = _measure("time to goal, median", "s")
-    """Time from which the goal was held until the end, in successful episodes; None if there are
-    none, or if the goal is to last until the time limit.
+    """Time from which the goal is held until the end, in successful episodes; None without
+    successful episodes, or if the goal is to survive until the time limit.
     """
     tracking_rms: float | None = _measure("shaft torque error, rms", "N*m")
-    """Root mean square of desired less delivered torque, of the motors of which a torque is asked;
-    None where there is none, as where the agent commands the voltage or a position, and none of the
-    tracking measures exists.
+    """Root mean square of desired minus delivered torque, over motors with a torque command. All
+    tracking measures are None without such a motor, as with a voltage or position command.
     """
     tracking_percent: float | None = _measure("shaft torque error / desired", "%")
-    """The same, relative to the root mean square of the desired torque."""
+    """Root mean square error, relative to that of the desired torque."""
     tracking_max: float | None = _measure("shaft torque error, largest", "N*m")
-    """Largest absolute difference."""
+    """Largest absolute error of the torque."""
     tracking_lag: float | None = _measure("shaft torque lag", "s")
-    """Delay of the delivered torque behind the desired one, where they correlate best; None where they hardly do."""
+    """Delay of the delivered torque at the best correlation; None if the correlation is weak."""
     torque_rms: float = _measure("shaft torque, rms", "N*m")
-    """Root mean square of the delivered torque: what wears gears and bearings, and heats a motor without a winding."""
+    """Root mean square of the delivered torque: a measure of wear, and of heating."""
     reversals: float = _measure("reversals", "1/s")
-    """How often the delivered torque changes its sign, per second and motor: what wears gears with play."""
+    """Sign changes of the delivered torque per second and motor, which wear gears with backlash."""
     saturated_percent: float | None = _measure("saturated, by any limit", "%")
-    """Share of integration steps in which the actuator was at a limit, whichever: a current loop's is the voltage's."""
+    """Share of integration steps at any limit; for a current loop, at the voltage limit."""
     voltage_saturated_percent: float | None = _measure("voltage saturated", "%")
-    """Of a drive: share of those in which the voltage was at the supply's."""
+    """Share of integration steps in which a drive's voltage was at the supply's limit."""
     current_saturated_percent: float | None = _measure("current saturated", "%")
-    """Those in which more than its largest current, or a servo's largest torque, was asked for."""
+    """Share of steps with a command above the drive's largest current or the servo's torque."""
     temperature_saturated_percent: float | None = _measure("temperature saturated", "%")
-    """Those in which the winding's temperature allowed less than was asked for."""
+    """Share of steps in which the winding's temperature limited the current."""
     peak_voltage: float | None = _measure("voltage, peak", "V")
     """Largest absolute voltage."""
     peak_current: float | None = _measure("current, peak", "A")
@@ -96,11 +95,11 @@ class Evaluation:
     peak_speed: float | None = _measure("shaft speed, peak", "rad/s")
     """Largest absolute speed of the motor's shaft."""
     peak_temperature: float | None = _measure("winding, hottest", "degC")
-    """Highest temperature of the winding; None where the motor has none."""
+    """Highest temperature of the winding; None without a thermal model."""
     energy_drawn: Interval | None = _measure("energy drawn", "J")
     """Electrical energy drawn, at the winding's terminals, in an episode."""
     energy_returned: Interval | None = _measure("energy returned", "J")
-    """Electrical energy returned to it in an episode, which many supplies cannot take."""
+    """Electrical energy returned to the supply in an episode, which many supplies cannot absorb."""
     copper_loss: Interval | None = _measure("copper loss", "J")
     """Heat in the winding in an episode."""
     magnetic_energy: Interval | None = _measure("energy in winding", "J")
@@ -110,17 +109,17 @@ class Evaluation:
     episode_returns: tuple[float, ...] = ()
     """Return of each episode, in the order of their seeds."""
     episode_times_to_goal: tuple[float | None, ...] = ()
-    """Time to the goal of each episode [s]; None where it did not succeed, 0 where the goal is to last."""
+    """Time to the goal of each episode [s]; None if it failed, 0 if the goal is to survive."""
     motors: Mapping[str, Mapping[str, float | None]] = dataclasses.field(default_factory=dict)
-    """Of several motors, what each of them did: name -> measure -> value, of energies the mean of an episode."""
+    """Measures of each of several motors: name -> measure -> value; energies are episode means."""
     conditions: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """What it was measured under: environment, seed and so on, as JSON-serialisable values."""
+    """Conditions of the evaluation (environment, seed, ...), as JSON-serializable values."""
 
     def as_mapping(self) -> dict[str, Any]:
-        """The evaluation as JSON-serialisable values.
+        """Return the evaluation as JSON-serializable values.
 
-        Intervals are mappings of `mean`, `low` and `high`, quartiles of `median`, `low` and `high`;
-        `units` has the unit of every measure.
+        An interval becomes a mapping with `mean`, `low` and `high`, quartiles one with `median`,
+        `low` and `high`; `units` maps each measure to its unit.
         """
         named = {
             name: (
@@ -138,7 +137,7 @@ class Evaluation:
 MEASURES: dict[str, dataclasses.Field[Any]] = {
     field.name: field for field in dataclasses.fields(Evaluation) if "unit" in field.metadata
 }
-"""The fields of `Evaluation` that are measures: their `metadata` has a `label` and a `unit`."""
+"""Measures of `Evaluation`: the fields whose `metadata` has a `label` and a `unit`."""
 
 
 def evaluate(
@@ -152,52 +151,51 @@ def evaluate(
     """Measure a policy on an actuator.
 
     Args:
-        policy: chooses actions.
-        env: an `EnvConfig`: task, actuator and all else; what it randomises is drawn for every
-            episode.
-        episodes: their number, >= 1.
-        seed: of the first episode, the others counting up from it; and of the actions that are
-            sampled.
-        deterministic: whether the policy takes its most likely action or samples.
+        policy: policy that chooses actions.
+        env: an `EnvConfig`; its randomized parameters are drawn for every episode.
+        episodes: number of episodes, >= 1.
+        seed: seed of the first episode, incremented for each further one; also the seed of sampled
+            actions.
+        deterministic: True for the most likely action, False for a sampled one.
         on_step: called with (episodes running, episodes finished) after every step.
 
     Raises:
         ValueError: an argument is unknown or out of bounds, or the policy was trained with other
             observations or actions.
-        SimulationDivergedError: a simulation left the finite numbers.
+        SimulationDivergedError: a simulation has a value that is not finite.
     """
-    # The bounds of forces are the task's; those of other commands may be another motor's on
-    # purpose.
+    # The task defines the bounds of forces. The bounds of other commands depend on the motor, and
+    # the policy may be tested on another one on purpose.
     check_spaces(policy, env, exact=env.action == "force")
-    ran = run_episodes(policy, env.make, episodes, seed, deterministic, on_step)
+    recorded_episodes = run_episodes(policy, env.make, episodes, seed, deterministic, on_step)
     conditions = {"env": env.as_mapping(), "seed": seed, "deterministic": deterministic}
-    return dataclasses.replace(summarize(env.task, ran), conditions=conditions)
+    return dataclasses.replace(summarize(env.task, recorded_episodes), conditions=conditions)
 
 
 def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     """Reduce episodes to an `Evaluation`.
 
     Args:
-        task: the world's name: a task's, or the id of an environment of others.
-        episodes: at least one, all of them with the same integration step.
+        task: name of a task, or id of a third-party environment.
+        episodes: at least one; all with the same integration step.
 
     Raises:
         ValueError: unknown task.
     """
-    world = find_source(task)
+    env_source = find_source(task)
     returns = np.array([episode.total for episode in episodes])
-    goals = [_time_to_goal(world, episode) for episode in episodes]
+    goals = [_time_to_goal(env_source, episode) for episode in episodes]
     reached = np.array([time for time in goals if time is not None])
     success = None
-    if any(world.at_goal(episode) is not None for episode in episodes):
+    if any(env_source.at_goal(episode) is not None for episode in episodes):
         success = wilson_rate(len(reached), len(episodes))
-    driven = [driven_in(episode) for episode in episodes]
+    traces_by_episode = [motor_traces(episode) for episode in episodes]
     each_motor = (
-        _measures(episodes, [[each[place]] for each in driven])
-        for place, _ in enumerate(episodes[0].motors)
+        _measures(episodes, [[traces[motor_index]] for traces in traces_by_episode])
+        for motor_index, _ in enumerate(episodes[0].motors)
     )
     return Evaluation(
-        task=world.name,
+        task=env_source.name,
         episodes=len(episodes),
         terminated=sum(episode.terminated for episode in episodes),
         returns=bootstrap_mean(returns),
@@ -210,49 +208,51 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
             if success is None
             else Interval(1 - success.mean, 1 - success.high, 1 - success.low)
         ),
-        time_to_goal=quartiles(reached) if world.timed and len(reached) else None,
+        time_to_goal=quartiles(reached) if env_source.timed and len(reached) else None,
         episode_returns=tuple(returns.tolist()),
         episode_times_to_goal=() if success is None else tuple(goals),
-        motors={  # of energies the mean
+        # A motor's energies are means over the episodes, without intervals.
+        motors={
             name: {
                 key: value.mean if isinstance(value, Interval) else value
                 for key, value in measures.items()
             }
             for name, measures in zip(episodes[0].motors, each_motor, strict=True)
         },
-        **_measures(episodes, driven),
+        **_measures(episodes, traces_by_episode),
     )
 
 
-def _time_to_goal(world: EnvSource, episode: Episode) -> float | None:
-    """Time from which an episode that succeeded was at the goal [s]; None if it did not succeed."""
-    step, at_goal = float(episode.time[0]), world.at_goal(episode)
+def _time_to_goal(env_source: EnvSource, episode: Episode) -> float | None:
+    """Return the time from which a successful episode holds the goal [s]; None if it failed."""
+    step, at_goal = float(episode.time[0]), env_source.at_goal(episode)
     if at_goal is None:
         return None
     since = holds_since(at_goal) * step
-    succeeded = since + world.goal_hold < episode.time[-1] + 0.5 * step  # half a step: rounding
+    # Half a step is added because times are sums of floating-point steps.
+    succeeded = since + env_source.goal_hold < episode.time[-1] + 0.5 * step
     return since if succeeded else None
 
 
 @dataclasses.dataclass(frozen=True)
-class Driven:
-    """What one motor did in an episode, at its shaft."""
+class MotorTrace:
+    """Recording of one motor in an episode, at its shaft."""
 
     actuator: ActuatorModel
     timestep: float
-    """Of the integration [s]."""
+    """Integration step [s]."""
     desired: np.ndarray
-    """Torque that the agent asked for in each integration step [N*m]."""
+    """Torque commanded by the agent in each integration step [N*m]."""
     actual: np.ndarray
-    """Torque delivered in it [N*m]."""
+    """Torque delivered in each integration step [N*m]."""
     speed: np.ndarray
     """Velocity of the joint before the first step and after each [m/s or rad/s]."""
     force: np.ndarray
-    """Force delivered to it [N or N*m]."""
+    """Force delivered to the joint [N or N*m]."""
     signals: dict[str, np.ndarray]
-    """The family's."""
-    tracks: bool
-    """True if a torque was asked of it. If False, `desired` is the torque delivered at each step's end."""
+    """Signals of the actuator family."""
+    is_torque_controlled: bool
+    """True if the command is a torque. If False, `desired` is the torque at each step's end."""
 
     @property
     def work(self) -> float:
@@ -260,82 +260,94 @@ class Driven:
         return mechanical_work(self.force, self.speed, self.timestep)
 
     @property
-    def wound(self) -> bool:
-        """Whether it has a winding whose current and voltage are known."""
+    def has_winding(self) -> bool:
+        """True if the motor has a winding with known current and voltage."""
         return {"current", "voltage"} <= self.signals.keys() and self.actuator.winding is not None
 
     @property
     def current(self) -> np.ndarray:
-        """Before the first step, which begins with none, and after each [A]."""
+        """Current before the first step, which is 0, and after each [A]."""
         return np.append(0.0, self.signals["current"])
 
 
-def driven_in(episode: Episode) -> list[Driven]:
-    """What each motor did."""
-    several = isinstance(episode.actuator, tuple)
-    made = []
-    for number, actuator in enumerate(episode.actuators):
-        own = {
-            name: values[:, number] if several else values for name, values in episode.trace.items()
+def motor_traces(episode: Episode) -> list[MotorTrace]:
+    """Return the recording of each motor."""
+    has_several = isinstance(episode.actuator, tuple)
+    traces = []
+    for motor_index, actuator in enumerate(episode.actuators):
+        motor_trace = {
+            name: values[:, motor_index] if has_several else values
+            for name, values in episode.trace.items()
         }
-        asked = (
-            episode.signals["desired_force"][:, number]
-            if several
+        desired = (
+            episode.signals["desired_force"][:, motor_index]
+            if has_several
             else episode.signals["desired_force"]
         )
-        arm, force, speed = actuator.arm_radius, own.pop("actual_force"), own.pop("speed")
-        shown = {
-            name: own[name] for name in actuator.Signals._fields if name in own
-        }  # others are of other families
-        made.append(
-            Driven(
+        arm, force, speed = (
+            actuator.arm_radius,
+            motor_trace.pop("actual_force"),
+            motor_trace.pop("speed"),
+        )
+        # With several motors the trace has the signals of all their families.
+        signals = {
+            name: motor_trace[name] for name in actuator.Signals._fields if name in motor_trace
+        }
+        traces.append(
+            MotorTrace(
                 actuator,
                 episode.timestep,
-                arm * np.repeat(asked, episode.inner_steps),
+                arm * np.repeat(desired, episode.inner_steps),
                 arm * force,
-                np.append(episode.first_speeds[number], speed),
+                np.append(episode.first_speeds[motor_index], speed),
                 force,
-                shown,
-                episode.tracks[number],
+                signals,
+                episode.is_torque_controlled[motor_index],
             )
         )
-    return made
+    return traces
 
 
-def _measures(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]]) -> dict[str, Any]:
-    """What motors were asked for and did, of each episode the same ones, on the mean of them.
+def _measures(
+    episodes: Sequence[Episode], traces_by_episode: Sequence[Sequence[MotorTrace]]
+) -> dict[str, Any]:
+    """Return the measures of the same motors in every episode, averaged over the motors.
 
-    How well the torque follows the desired one, which is held over an environment step; what the
-    delivered one does to gears and bearings; what that asks of the supply; the work done.
+    They describe how well the torque follows the command (which is held over an environment step),
+    the load on gears and bearings, the load on the supply, and the mechanical work.
     """
-    actual = [one.actual for each in driven for one in each]
+    actual = [trace.actual for traces in traces_by_episode for trace in traces]
     delivered = np.concatenate(actual)
-    tracked = [[one for one in each if one.tracks] for each in driven]
-    found: dict[str, Any] = dict.fromkeys(
+    tracked = [
+        [trace for trace in traces if trace.is_torque_controlled] for traces in traces_by_episode
+    ]
+    tracking: dict[str, Any] = dict.fromkeys(
         ("tracking_rms", "tracking_percent", "tracking_max", "tracking_lag")
     )
     if all(tracked):
-        desired, followed = (
-            [getattr(one, name) for each in tracked for one in each]
+        desired, delivered_desired = (
+            [getattr(trace, name) for traces in tracked for trace in traces]
             for name in ("desired", "actual")
         )
-        asked = np.concatenate(desired)
-        error = asked - np.concatenate(followed)
-        rms, scale = _root_mean_square(error), _root_mean_square(asked)
-        found = {
+        command = np.concatenate(desired)
+        error = command - np.concatenate(delivered_desired)
+        rms, scale = _root_mean_square(error), _root_mean_square(command)
+        tracking = {
             "tracking_rms": rms,
             "tracking_percent": 100 * rms / scale if scale > 0 else None,
             "tracking_max": float(np.abs(error).max()),
-            "tracking_lag": delay(desired, followed, episodes[0].timestep, len(tracked[0])),
+            "tracking_lag": delay(
+                desired, delivered_desired, episodes[0].timestep, len(tracked[0])
+            ),
         }
-    duration = math.fsum(episode.time[-1] for episode in episodes) * len(driven[0])
+    duration = math.fsum(episode.time[-1] for episode in episodes) * len(traces_by_episode[0])
     return {
-        **found,
+        **tracking,
         "torque_rms": _root_mean_square(delivered),
         "reversals": sum(map(sign_changes, actual)) / duration,
-        **_electrical(episodes, driven),
+        **_electrical(episodes, traces_by_episode),
         "mechanical_work": bootstrap_mean(
-            np.array([sum(one.work for one in each) for each in driven])
+            np.array([sum(trace.work for trace in traces) for traces in traces_by_episode])
         ),
     }
 
@@ -344,10 +356,12 @@ def _root_mean_square(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]]) -> dict[str, Any]:
-    """What was asked of the actuators: of any but the ideal one, and of windings, as far as the family shows it."""
-    each = (f"{limit}_saturated" for limit in ("voltage", "current", "temperature"))
-    limits = {f"{name}_percent": name for name in ("saturated", *each)}
+def _electrical(
+    episodes: Sequence[Episode], traces_by_episode: Sequence[Sequence[MotorTrace]]
+) -> dict[str, Any]:
+    """Return the measures of non-ideal actuators and their windings; None without the signals."""
+    traces = (f"{limit}_saturated" for limit in ("voltage", "current", "temperature"))
+    limits = {f"{name}_percent": name for name in ("saturated", *traces)}
     names = (
         "peak_voltage",
         "peak_current",
@@ -356,38 +370,46 @@ def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]])
         "peak_temperature",
         "energy_drawn",
     )
-    found: dict[str, Any] = dict.fromkeys(
+    measures: dict[str, Any] = dict.fromkeys(
         (*limits, *names, "energy_returned", "copper_loss", "magnetic_energy")
     )
-    every = [one for each in driven for one in each if not isinstance(one.actuator, Ideal)]
-    if not every:
-        return found
-    found["peak_speed"] = max(
-        float(np.abs(one.speed).max()) / one.actuator.arm_radius for one in every
+    all_traces = [
+        trace
+        for traces in traces_by_episode
+        for trace in traces
+        if not isinstance(trace.actuator, Ideal)
+    ]
+    if not all_traces:
+        return measures
+    measures["peak_speed"] = max(
+        float(np.abs(trace.speed).max()) / trace.actuator.arm_radius for trace in all_traces
     )
     for measure, name in limits.items():
-        if limited := [one.signals[name] for one in every if name in one.signals]:
-            found[measure] = float(100 * np.concatenate(limited).mean())
-    warmed = [one.signals["temperature"] for one in every if "temperature" in one.signals]
-    if warmed and any(
-        np.ptp(values) > 0.0 for values in warmed
-    ):  # constant where nothing is known of it
-        found["peak_temperature"] = float(np.concatenate(warmed).max())
-    wound = [[one for one in each if one.wound] for each in driven]
-    every = [one for each in wound for one in each]
-    if not every:
-        return found
-    energies = [[_energies(one) for one in each] for each in wound]
+        if flags := [trace.signals[name] for trace in all_traces if name in trace.signals]:
+            measures[measure] = float(100 * np.concatenate(flags).mean())
+    temperatures = [
+        trace.signals["temperature"] for trace in all_traces if "temperature" in trace.signals
+    ]
+    # Without a thermal model the signal is constant.
+    if temperatures and any(np.ptp(values) > 0.0 for values in temperatures):
+        measures["peak_temperature"] = float(np.concatenate(temperatures).max())
+    with_winding = [
+        [trace for trace in traces if trace.has_winding] for traces in traces_by_episode
+    ]
+    all_traces = [trace for traces in with_winding for trace in traces]
+    if not all_traces:
+        return measures
+    energies = [[_energies(trace) for trace in traces] for traces in with_winding]
     drawn, returned, copper, magnetic, squares = np.array(
-        [np.sum(each, axis=0) for each in energies]
+        [np.sum(traces, axis=0) for traces in energies]
     ).T
-    duration = math.fsum(episode.time[-1] for episode in episodes) * len(wound[0])
-    return found | {
+    duration = math.fsum(episode.time[-1] for episode in episodes) * len(with_winding[0])
+    return measures | {
         "peak_voltage": float(
-            np.abs(np.concatenate([one.signals["voltage"] for one in every])).max()
+            np.abs(np.concatenate([trace.signals["voltage"] for trace in all_traces])).max()
         ),
         "peak_current": float(
-            np.abs(np.concatenate([one.signals["current"] for one in every])).max()
+            np.abs(np.concatenate([trace.signals["current"] for trace in all_traces])).max()
         ),
         "rms_current": math.sqrt(squares.sum() / duration),
         "energy_drawn": bootstrap_mean(drawn),
@@ -397,17 +419,19 @@ def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]])
     }
 
 
-def _energies(one: Driven) -> tuple[float, float, float, float, float]:
-    """Energy [J] drawn, returned, lost in the winding and left in it; the integral of the squared current [A^2*s]."""
-    assert one.actuator.winding is not None
-    resistance, inductance = one.actuator.winding
-    stored = inductance * one.current[-1] ** 2 / 2
-    if isinstance(one.actuator, Drive):  # whose steps are long beside its winding
-        heat = one.signals["copper_loss"] * one.timestep
-        temperature: Any = one.signals["temperature"]
-        warm = shaft.resistance_at(one.actuator.motor, temperature)
-        drawn, returned = drawn_and_returned(one.signals["electrical_power"] * one.timestep)
-        return drawn, returned, float(heat.sum()), stored, float((heat / warm).sum())
-    drawn, returned = electrical_energy(one.signals["voltage"], one.current, one.timestep)
-    square = integral_of_square(one.current, one.timestep)
+def _energies(trace: MotorTrace) -> tuple[float, float, float, float, float]:
+    """Return energies [J] drawn, returned, lost and stored, and the integral of i^2 [A^2*s]."""
+    assert trace.actuator.winding is not None
+    resistance, inductance = trace.actuator.winding
+    stored = inductance * trace.current[-1] ** 2 / 2
+    # An integration step of a drive is long compared to its winding's time constant, so the samples
+    # of the current do not give the energies. The drive integrates them within each step.
+    if isinstance(trace.actuator, Drive):
+        heat = trace.signals["copper_loss"] * trace.timestep
+        temperature: Any = trace.signals["temperature"]
+        warm_resistance = shaft.resistance_at(trace.actuator.motor, temperature)
+        drawn, returned = drawn_and_returned(trace.signals["electrical_power"] * trace.timestep)
+        return drawn, returned, float(heat.sum()), stored, float((heat / warm_resistance).sum())
+    drawn, returned = electrical_energy(trace.signals["voltage"], trace.current, trace.timestep)
+    square = integral_of_square(trace.current, trace.timestep)
     return drawn, returned, resistance * square, stored, square

@@ -12,7 +12,7 @@ from dm_env import specs
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.disturbances import OFF, resolve
+from codrl_mj.disturbances import NO_DISTURBANCES, resolve
 from codrl_mj.engine.specs import resolve_patterns
 from codrl_mj.envs.motors import ActuatorBank, MotorSettings
 from codrl_mj.external_envs import check_dm_control
@@ -195,7 +195,7 @@ def make_dm_control(
     """
     check_dm_control()
     resolved = resolve_patterns(actuators, "a dm_control environment")
-    disturbed = resolve(disturbances, OFF)
+    disturbed = resolve(disturbances, NO_DISTURBANCES)
     settings = MotorSettings(
         resolved, action, False, randomize, disturbed, allow_unstable, joint_dynamics
     )

@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.utils import RecordConstructorArgs
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.disturbances import OFF, resolve
+from codrl_mj.disturbances import NO_DISTURBANCES, resolve
 from codrl_mj.engine.reading import bring_to_rest, motor_slots, motors
 from codrl_mj.engine.specs import resolve_patterns
 from codrl_mj.envs.motors import ActuatorBank, MotorSettings, extend_space
@@ -29,7 +29,7 @@ from codrl_mj.envs.snapshots import (
     state_of,
 )
 from codrl_mj.external_envs.building import ModelPatcher
-from codrl_mj.physics.streams import words_of
+from codrl_mj.physics.streams import generator_words
 
 
 def make(
@@ -93,7 +93,7 @@ def make(
         action,
         observe_actuator,
         randomize,
-        resolve(disturbances, OFF),
+        resolve(disturbances, NO_DISTURBANCES),
         allow_unstable,
         joint_dynamics,
     )
@@ -304,8 +304,8 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         return {
             "environment": encode_name(self._id),
             **(state_of(self._bank.data) if self._has_known_state else {}),
-            "generator": words_of(self.unwrapped.np_random),
-            "motors_generator": words_of(self._generator),
+            "generator": generator_words(self.unwrapped.np_random),
+            "motors_generator": generator_words(self._generator),
             "elapsed_steps": elapsed_steps(self.env),
             **self._bank.snapshot(),
         }

@@ -196,10 +196,10 @@ class Column:
         kind, unit = COLUMN_UNITS[self.signal], self.unit
         if unit is None or (not kind and unit in ("", "1")):
             return value
-        from codrl_mj.catalogue.units import in_si
+        from codrl_mj.catalogue.units import to_si
 
         try:
-            return in_si(value, unit, kind, self.signal)
+            return to_si(value, unit, kind, self.signal)
         except ValueError as error:
             raise self._error(
                 f"{error}; write {kind or '1'}, or another unit of its kind"

@@ -32,7 +32,7 @@ from codrl_mj.identify.synthetic import (
     simulate,
     simulate_drive,
 )
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 
 GOALS = {
     "resistance": 0.02,
@@ -159,7 +159,7 @@ def write_excitation(path: Path, option: Option) -> None:
     # The small offset keeps a sample that is due at a change of the voltage from falling before it.
     time = np.arange(round(option.excitation.duration * option.rate) + 1) / option.rate
     table = np.column_stack([time, option.excitation.voltage(time + 1e-9 / option.rate)])
-    with writing(path) as temporary:
+    with atomic_write(path) as temporary:
         np.savetxt(temporary, table, fmt="%.10g", delimiter=",", header="time,voltage", comments="")
 
 

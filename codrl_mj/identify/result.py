@@ -11,7 +11,7 @@ import numpy as np
 from codrl_mj.identify.estimate import Fit, best_initial_state
 from codrl_mj.identify.log import Log, Segment, gapless_stretches, initial_state
 from codrl_mj.identify.parameters import DEFAULTS, OF_MOTOR, PARAMETERS
-from codrl_mj.runs.files import write_json, writing
+from codrl_mj.runs.files import atomic_write, write_json
 
 Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "refused"]
 ACTUATOR = "actuator.yaml"  # name of the file in a folder of results
@@ -372,6 +372,6 @@ class Identified:
         intervals = {name: list(ends) for name, ends in self.intervals().items()}
         section: dict[str, Any] = {"logs": list(self.logs), "intervals": intervals}
         content = {**self.actuator().as_mapping(), "identified": section}
-        with writing(actuator) as temporary:
+        with atomic_write(actuator) as temporary:
             temporary.write_text(yaml.safe_dump(content, sort_keys=False))
         return [actuator, result]

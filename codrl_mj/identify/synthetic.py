@@ -17,7 +17,7 @@ from codrl_mj.actuators.shaft import resistance_at
 from codrl_mj.fields import Checked, check_memory, check_names, real
 from codrl_mj.identify.columns import COLUMN_UNITS
 from codrl_mj.identify.log import Log
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,9 +96,9 @@ EXCITATIONS: dict[str, Callable[[Excitation, np.ndarray], np.ndarray]] = {
 class Load(Checked):
     """The load at the output shaft."""
 
-    inertia: float = real(0.0, least=0.0, unit="kg*m^2")
+    inertia: float = real(0.0, minimum=0.0, unit="kg*m^2")
     """Inertia [kg*m^2] at the output without the rotor's, >= 0."""
-    gravity: float = real(0.0, least=0.0, unit="N*m")
+    gravity: float = real(0.0, minimum=0.0, unit="N*m")
     """m*g*l [N*m] of a pendulum that hangs at position 0, >= 0."""
     against: float = real(0.0, unit="N*m")
     """Constant torque [N*m] against the motor, as that of a lifted weight."""
@@ -118,17 +118,17 @@ _SAMPLE_SIZE, _ROW_SIZE = (80, 200)
 class Sensor(Checked):
     """A sensor: value -> gain * value(time - delay) + bias + noise, then rounded."""
 
-    noise: float = real(0.0, least=0.0, unit="")
+    noise: float = real(0.0, minimum=0.0, unit="")
     """Standard deviation of white noise, >= 0, in the signal's unit."""
-    resolution: float = real(0.0, least=0.0, unit="")
+    resolution: float = real(0.0, minimum=0.0, unit="")
     """Step of the rounding, >= 0, in the signal's unit; 0: none."""
-    delay: float = real(0.0, least=0.0, unit="s")
+    delay: float = real(0.0, minimum=0.0, unit="s")
     """Age [s] of the values, >= 0."""
     gain: float = real(1.0, unit="")
     """Measured value over the true value; -1 is a wrong sign."""
     bias: float = real(0.0, unit="")
     """Measured value of a true value of 0, in the signal's unit."""
-    outliers: float = real(0.0, least=0.0, most=1.0)
+    outliers: float = real(0.0, minimum=0.0, maximum=1.0)
     """Share of values, in [0, 1], that are off by 3 to 10 of the signal's standard deviations."""
 
     def measure(self, values: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -150,9 +150,9 @@ class Sampler(Checked):
 
     rate: float = real(5000.0, above=0.0, unit="Hz")
     """Rows per second [Hz], > 0."""
-    jitter: float = real(0.0, least=0.0, most=0.3)
+    jitter: float = real(0.0, minimum=0.0, maximum=0.3)
     """Standard deviation of the times over the period, in [0, 0.3]; time stamps are exact."""
-    dropped: float = real(0.0, least=0.0, most=0.9)
+    dropped: float = real(0.0, minimum=0.0, maximum=0.9)
     """Share of rows that are lost, in [0, 0.9]."""
     mean_voltage: bool = False
     """True if a row has the mean voltage until the next row, False if the instantaneous one."""
@@ -202,7 +202,7 @@ def simulate_drive(
     }
     parts = winding, shaft_parameters(parameters, motor.torque_constant * motor.gear_ratio)
     states = simulate_samples(
-        period, shares, float(limit), float(drive.sag), parts, locked, float(position)
+        period, shares, float(limit), float(drive.supply_resistance), parts, locked, float(position)
     )
     names = "voltage", "current", "velocity", "position", "bus"
     signals = dict(zip(names, states.T, strict=True))
@@ -300,7 +300,7 @@ def write_log(path: Path, log: Log) -> str:
     """Write a log as CSV (.csv or .csv.gz) atomically, and return its columns for `read_log`."""
     names = ["time", *log.signals]
     table = np.column_stack([log.time, *log.signals.values()])
-    with writing(path) as temporary:
+    with atomic_write(path) as temporary:
         np.savetxt(temporary, table, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
     texts = {
         name: f"mean({name})" if log.mean_voltage and name == "voltage" else name for name in names

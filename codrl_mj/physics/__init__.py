@@ -1,7 +1,7 @@
-"""Simulation of a task: in MuJoCo or on Gymnasium's analytic dynamics, behind one small interface, by name.
+"""Simulations of a task, in MuJoCo or with Gymnasium's analytic dynamics, behind one interface.
 
-Read `base`, then `mjcf` (actuators into the model), `stepping` (a step, compiled), `mujoco_single`;
-many simulations are rows in threads' hands: `rows`, `sharing`, `mujoco_batch`.
+Read `base`, then `mjcf` (actuators in the model), `stepping` (a compiled step) and `mujoco_single`.
+Many simulations are rows of arrays that several threads step: `rows`, `sharing`, `mujoco_batch`.
 """
 
 from collections.abc import Callable
@@ -23,14 +23,15 @@ PHYSICS.update(mujoco=MujocoPhysics, analytic=AnalyticPhysics)
 
 
 def register_physics(name: str, make: Callable[[SimulationConfig], Physics]) -> None:
-    """Make a physics of one's own known: every face but the batched one takes its name as `physics`.
+    """Register a custom physics; its name is an option `physics` of single environments.
 
     Args:
-        name: what to call it.
-        make: (`codrl_mj.physics.SimulationConfig`) -> a simulation of it, a `codrl_mj.physics.Physics`.
+        name: its name.
+        make: (`codrl_mj.physics.SimulationConfig`) -> a `codrl_mj.physics.Physics` that simulates
+            it.
 
     Raises:
-        ValueError: the name is taken by another.
+        ValueError: the name belongs to another physics.
     """
     if PHYSICS.setdefault(name, make) is not make:
         raise ValueError(

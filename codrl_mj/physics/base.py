@@ -1,4 +1,4 @@
-"""The small interface behind which a task is simulated."""
+"""Interface of the simulation of a task."""
 
 import abc
 import dataclasses
@@ -9,40 +9,44 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Family, Ideal, check_same_family
-from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
+from codrl_mj.disturbances import NO_DISTURBANCES, UNMODIFIED_JOINT, Disturbances, Joint
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
 
 Signals = dict[str, Any]
-"""What the actuators did during one environment step, by name: `desired_force` and `actual_force`
-[N or N*m], the family's signals at the end of the last integration step, and `saturated`. Numbers
-for a task with one actuator; arrays (n,) for one with several; in a batch one axis more, the first.
+"""Signals of the actuators after one environment step, by name: `desired_force` and `actual_force`
+[N or N*m], the family's signals at the end of the last integration step, and `saturated`. Values
+are numbers for a task with one actuator and arrays (n,) for several; a batch adds a first axis.
 """
 
 
 def trace_names(family: Family) -> tuple[str, ...]:
-    """Columns of `Physics.trace`.
+    """Return the columns of `Physics.trace`.
 
-    The force [N or N*m] asked of the actuator in an integration step (after whatever disturbs
-    commands on their way) and delivered in it, the family's signals at its end, and the velocity of
-    the actuated joint [m/s or rad/s] at its end.
+    They are the force [N or N*m] commanded to the actuator in an integration step, after
+    disturbances of the command, the force delivered in it, the family's signals at its end, and the
+    velocity of the actuated joint [m/s or rad/s] at its end.
     """
     return ("desired_force", "actual_force", *family.Signals._fields, "speed")
 
 
 def signal_names(family: Family) -> tuple[str, ...]:
-    """Keys of `Signals`, in order."""
+    """Return the keys of `Signals`, in order."""
     return (*(name for name in trace_names(family)[:-1] if name != "saturated"), "saturated")
 
 
 @functools.cache
 def make_info_reader(names: tuple[str, ...]) -> Callable[[Any], Signals]:
-    """What names the first columns, numbers of one actuator or arrays of several; `saturated`, a flag, is the last.
+    """Return a function that names columns: numbers of one actuator, or arrays of several.
 
-    It is false, in the columns' shape, of a family that has none. Written out, as `namedtuple` is:
-    with a loop it would take a tenth of an environment's step.
+    The last entry is the flag `saturated`; if the family has no such signal, it is False in the
+    columns' shape.
     """
-    entries = [f"{name!r}: columns[{at}]" for at, name in enumerate(names) if name != "saturated"]
+    # The dictionary is generated as source text, as `namedtuple` does: a loop would take a tenth of
+    # an environment's step.
+    entries = [
+        f"{name!r}: columns[{index}]" for index, name in enumerate(names) if name != "saturated"
+    ]
     flag = (
         f"columns[{names.index('saturated')}] > 0.0"
         if "saturated" in names
@@ -51,15 +55,15 @@ def make_info_reader(names: tuple[str, ...]) -> Callable[[Any], Signals]:
     return eval(f"lambda columns: {{{', '.join(entries)}, 'saturated': {flag}}}")
 
 
-LARGEST = 1e10
-"""Largest magnitude of a state entry: MuJoCo's `mjMAXVAL`, beyond which it warns and discards
-forces. A diverging motor need not reach infinity there.
+MAX_STATE = 1e10
+"""Largest magnitude of a state entry: MuJoCo's `mjMAXVAL`, beyond which MuJoCo warns and discards
+forces. A diverging motor need not reach infinity then.
 """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SimulationConfig:
-    """What is simulated: a task and its actuators, and how finely; every physics is made of one.
+    """Settings of a simulation: a task, its actuators and the integration, for any physics.
 
     Raises:
         ValueError: the actuators are of several families.
@@ -68,38 +72,43 @@ class SimulationConfig:
     task: Task
     """The task."""
     actuators: Sequence[ActuatorModel]
-    """What stands between desired and delivered force, one for each of the task's motors, of one family."""
+    """Actuators, one for each of the task's motors, all of one family."""
     inner_steps: int = 1
     """Integration steps per environment step."""
     integrator: str = ""
-    """One of the task's integrators, the first of them unless told otherwise."""
+    """One of the task's integrators; the first by default."""
     max_forces: np.ndarray = None  # type: ignore[assignment]
-    """Limits of the desired forces [N] or torques [N*m], shape (n,); the task's unless told otherwise."""
-    disturbances: Disturbances = OFF
-    """Imperfections of the commands' way, and load pulses."""
-    joint: Joint = PLAIN
-    """What is added to the actuated joints."""
-    holds: np.ndarray = None  # type: ignore[assignment]
-    """Desired force [N or N*m] that stands for a position of 1 m or rad, shape (n,); 0 where commands are none."""
+    """Limits of the desired forces [N] or torques [N*m], shape (n,); those of the task by default.
+    """
+    disturbances: Disturbances = NO_DISTURBANCES
+    """Imperfections of the commands, and load pulses."""
+    joint: Joint = UNMODIFIED_JOINT
+    """Quantities added to the actuated joints."""
+    force_per_position: np.ndarray = None  # type: ignore[assignment]
+    """Desired force [N or N*m] that corresponds to a position of 1 m or rad, shape (n,); 0 where
+    commands are not positions.
+    """
 
     def __post_init__(self) -> None:
-        """Fill in what is the task's."""
+        """Fill in the task's defaults."""
         check_same_family(self.actuators)
         if not self.integrator:
             object.__setattr__(self, "integrator", self.task.integrators[0])
+        # The dataclass is frozen, so defaults that depend on other fields are written past its
+        # `__setattr__`.
         if self.max_forces is None:
             object.__setattr__(self, "max_forces", self.task.max_forces)
-        if self.holds is None:
-            object.__setattr__(self, "holds", np.zeros(len(self.max_forces)))
+        if self.force_per_position is None:
+            object.__setattr__(self, "force_per_position", np.zeros(len(self.max_forces)))
 
     @functools.cached_property
     def family(self) -> Family:
-        """The actuators' family."""
+        """Family of the actuators."""
         return type(self.actuators[0])
 
     @property
     def motors_added(self) -> bool:
-        """Whether the actuators are any but the ideal one."""
+        """True unless all actuators are ideal."""
         return not issubclass(self.family, Ideal)
 
     @property
@@ -107,72 +116,81 @@ class SimulationConfig:
         """Integration step [s]."""
         return self.task.step_duration / self.inner_steps
 
-    def held(self, states: np.ndarray) -> np.ndarray:
-        """Return the desired forces that hold states (m, s) there, shape (m, n): 0 unless commands are positions."""
+    def holding_forces(self, states: np.ndarray) -> np.ndarray:
+        """Return the desired forces (m, n) that hold states (m, s); 0 for force commands."""
         task = self.task
         positions = states[:, [task.qpos[task.qvel.index(speed)] for speed in task.speed_indices]]
-        return np.where(self.holds != 0.0, self.holds * positions, 0.0)
+        return np.where(self.force_per_position != 0.0, self.force_per_position * positions, 0.0)
 
 
 class Physics(abc.ABC):
-    """One simulation of a plant.
+    """One simulation of a task.
 
-    Somebody's own is given to `codrl_mj.physics.register_physics`. What it cannot simulate it
-    refuses when it is made.
+    A custom class is registered with `codrl_mj.physics.register_physics`. Its constructor must
+    raise for everything that it cannot simulate.
     """
 
     stepping: Any = None
-    """The compiled functions of a loop (see `codrl_mj.physics.stepping.Stepping`); None where a step is Python."""
-    where: int = 0
-    """Their last argument, an address; 0 where there are none."""
-    bound: tuple[Any, ...] = ()
-    """An environment's options and observation, which its compiled steps read and fill, where these were asked for."""
+    """Compiled functions of a loop (see `codrl_mj.physics.stepping.Stepping`); None if a step is
+    Python code.
+    """
+    pointers: int = 0
+    """Address of the `PointerTable`, the last argument of the compiled functions; 0 if there are
+    none.
+    """
+    bound_arrays: tuple[Any, ...] = ()
+    """Arrays of the environment's options and observation that its compiled steps read and fill;
+    empty until they are needed.
+    """
     scene: tuple[Any, Any] | None = None
-    """The `mujoco.MjModel` and `mujoco.MjData` that it runs on; None where there are none."""
+    """`mujoco.MjModel` and `mujoco.MjData` of the simulation; None without MuJoCo."""
 
     state: np.ndarray
-    """The mechanical state in the task's order, shape (n,), float64; not changed by later steps.
-    Set, it moves the simulation there, the motor left as it is.
+    """Mechanical state in the task's order, shape (n,), float64; later steps do not change the
+    array. Setting it moves the simulation to a state and leaves the motor unchanged.
     """
     time: float
-    """Since the start of the episode [s]."""
+    """Time since the start of the episode [s]."""
 
-    def __init__(self, plant: SimulationConfig) -> None:
-        """Take what is simulated, and make what one of it needs on any physics."""
-        self.plant = plant
-        """What is simulated."""
+    def __init__(self, simulation: SimulationConfig) -> None:
+        """Store the configuration, and create the trace and the disturber."""
+        self.simulation = simulation
+        """Settings of the simulation."""
         self.trace = np.zeros(
-            (plant.inner_steps, len(plant.actuators), len(trace_names(plant.family)))
+            (simulation.inner_steps, len(simulation.actuators), len(trace_names(simulation.family)))
         )
-        """What each actuator did in each integration step of the last environment step, shape
-        (inner_steps, actuators, columns), float64; columns as in `trace_names`. A live array: the
-        next step overwrites it.
+        """Values of each actuator in each integration step of the last environment step, shape
+        (inner_steps, actuators, columns), float64; columns as in `trace_names`. The next step
+        overwrites the array.
         """
         self._disturber = Disturber(
-            plant.disturbances, plant.timestep, plant.max_forces, 1, plant.holds
+            simulation.disturbances,
+            simulation.timestep,
+            simulation.max_forces,
+            1,
+            simulation.force_per_position,
         )
 
     @abc.abstractmethod
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
-        """Exchange the actuators for others of their family; to be followed by a reset.
+        """Replace the actuators by others of their family; a reset must follow.
 
-        What they add to their joints is the model's: see `set_model`.
+        Quantities that they add to their joints belong to the model: see `set_model`.
         """
 
     def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
-        """Change fields of the model, as `codrl_mj.physics.variation.Variation.fields` has them; then a reset follows.
+        """Change fields of the model, named as in `Variation.fields`; a reset must follow.
 
         Raises:
-            ValueError: it has no such fields, because it is not on a MuJoCo model; none at all is
-                never refused.
+            ValueError: the simulation has no MuJoCo model; no fields at all are always accepted.
         """
         if fields:
-            own = next(
+            physics_name = next(
                 (name for name, make in PHYSICS.items() if make is type(self)), type(self).__name__
             )
             raise ValueError(
-                f"fields = {', '.join(fields)}: they are a MuJoCo model's, which {own!r} has not;"
-                " use 'mujoco'"
+                f"fields = {', '.join(fields)}: only a MuJoCo model has such fields, not"
+                f" {physics_name!r}; use 'mujoco'"
             )
 
     @abc.abstractmethod
@@ -181,12 +199,12 @@ class Physics(abc.ABC):
 
         Args:
             state: the mechanical state.
-            key: of the random numbers of the episode's disturbances and sensors.
+            key: key of the random numbers of the episode's disturbances and sensors.
         """
 
     @abc.abstractmethod
-    def observed(self, row: np.ndarray) -> np.ndarray:
-        """What the sensors say at present, shape (actuators, k), with k as the family's `OBSERVED`.
+    def read_sensors(self, row: np.ndarray) -> np.ndarray:
+        """Return the sensors' readings, shape (actuators, k), k as in the family's `OBSERVED`.
 
         Args:
             row: the last row of `trace`; zeros at the start of an episode.
@@ -194,20 +212,23 @@ class Physics(abc.ABC):
 
     @abc.abstractmethod
     def snapshot(self) -> np.ndarray:
-        """Simulation and actuators as a vector, shape (k,), float64, without `memory` and exchanged parameters."""
+        """Return simulation and actuators as a vector, shape (k,), float64, without `memory`.
+
+        Replaced parameters are not included either.
+        """
 
     @abc.abstractmethod
     def restore(self, snapshot: np.ndarray) -> None:
-        """Continue from what `snapshot` returned."""
+        """Continue from the result of `snapshot`."""
 
     @property
     def memory(self) -> np.ndarray:
-        """What the disturbances remember beside, a live array; empty if nothing."""
+        """State of the disturbances, a live array; empty without any."""
         return self._disturber.memory.reshape(-1)
 
     @abc.abstractmethod
     def step(self, desired_force: Any) -> None:
-        """Advance by one environment step, with the desired force (at most the plant's `max_forces`) held over it.
+        """Advance by one environment step with a held desired force of at most `max_forces`.
 
         Args:
             desired_force: a number; for several actuators an array (n,).
@@ -217,40 +238,48 @@ class Physics(abc.ABC):
         """
 
     def check_finite(self) -> None:
-        """Raise if the state left the finite numbers or is beyond `LARGEST`, saying which entry and when.
+        """Raise if a state entry is not finite or exceeds `MAX_STATE`.
 
         Raises:
-            SimulationDivergedError: it did.
+            SimulationDivergedError: the simulation diverged.
         """
-        state, task = self.state, self.plant.task
-        if state @ state <= LARGEST:  # the quick answer: all are below 1e5; false for NaN too
+        state, task = self.state, self.simulation.task
+        # This fast test suffices in nearly all steps: every entry is below 1e5. It is false for
+        # NaN, too.
+        if state @ state <= MAX_STATE:
             return
-        fine = np.abs(state) <= LARGEST
-        if fine.all():
+        is_valid = np.abs(state) <= MAX_STATE
+        if is_valid.all():
             return
         broken = ", ".join(
-            f"{n} = {v:g}" for n, v, ok in zip(task.state_names, state, fine, strict=True) if not ok
+            f"{n} = {v:g}"
+            for n, v, valid in zip(task.state_names, state, is_valid, strict=True)
+            if not valid
         )
-        raise diverged(task.name, self.time, broken)
+        raise divergence_error(task.name, self.time, broken)
 
     def show(self, state: np.ndarray) -> None:
-        """Bring the bodies of `scene` to a state, for drawing; the simulation is left alone otherwise."""
-        del state  # without a scene
+        """Move the bodies of `scene` to a state, for drawing; nothing else changes."""
+        # Without a scene there is nothing to move.
+        del state
 
 
 PHYSICS: dict[str, Callable[[SimulationConfig], Any]] = {}
-"""The physics that an environment can be built on, by name: what makes a simulation of a plant."""
+"""Available physics by name: functions from a `SimulationConfig` to a simulation."""
 
 
 class SimulationDivergedError(ArithmeticError):
-    """A simulation left the finite numbers, or the range in which MuJoCo trusts its own."""
+    """The simulation is not finite, or exceeds the range that MuJoCo accepts."""
 
 
-def diverged(
-    who: str, time: float, broken: str, step: str = "inner_steps"
+def divergence_error(
+    name: str, time: float, broken: str, step_setting: str = "inner_steps"
 ) -> SimulationDivergedError:
-    """The error of an environment whose simulation broke down at a time [s], with what sets its integration step."""
+    """Return the error of a simulation that diverged at a time [s].
+
+    `step_setting` is the name of the setting of its integration step.
+    """
     return SimulationDivergedError(
-        f"{who}: the simulation diverged at t = {time:g} s: {broken}. Reset the environment; if"
-        f" this repeats, shorten the integration step ({step}) or lower the gains"
+        f"{name}: the simulation diverged at t = {time:g} s: {broken}. Reset the environment; if"
+        f" this repeats, shorten the integration step ({step_setting}) or lower the gains"
     )

@@ -1,8 +1,8 @@
-"""A task's functions, compiled, once a process: what it makes of its states, their bounds and their order.
+"""Compiled functions of a task, once per process: its outcomes, its bounds, and its state's order.
 
-There is one compiled form of observation, reward and end, and every face calls it: a library's
-cosine may differ from another's in the last bit. What has to do with MuJoCo's `qpos` and `qvel`
-takes them as pointers or as arrays.
+Observation, reward and termination have one compiled form that all environments call, because the
+cosine of one library may differ from that of another in the last bit. Functions of MuJoCo's `qpos`
+and `qvel` take them as pointers or as arrays.
 """
 
 import functools
@@ -16,7 +16,7 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from codrl_mj.compile_cache import njit
 from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import entries_type, internal, named_tuple_type, read_row, to_floats
-from codrl_mj.physics.base import LARGEST
+from codrl_mj.physics.base import MAX_STATE
 from codrl_mj.tasks import Task
 
 Compiled = Callable[..., Any]
@@ -24,7 +24,7 @@ Compiled = Callable[..., Any]
 
 @functools.cache
 def compiled_reader(positions: tuple[int, ...], velocities: tuple[int, ...]) -> Compiled:
-    """(qpos, qvel, state (n,)) -> nothing: fills `state`, in the order of a task with such `qpos` and `qvel`."""
+    """Return (qpos, qvel, state (n,)) -> None, which fills `state` in the task's order."""
 
     @internal
     def read(qpos: Any, qvel: Any, state: np.ndarray) -> None:
@@ -43,61 +43,61 @@ def compiled_constrain(
     positions: tuple[int, ...],
     velocities: tuple[int, ...],
 ) -> Compiled | None:
-    """(qpos, qvel, scratch (n,), integration step [s]) -> nothing: a task's `constrain`, applied in place.
+    """Return (qpos, qvel, scratch (n,), step [s]) -> None, which applies `constrain` in place.
 
-    None for a task without bounds. A state beyond `LARGEST` becomes NaN in all its entries, to be
-    noticed: within its bounds it would look like any other.
+    The result is None for a task without bounds. All entries of a state beyond `MAX_STATE` become
+    NaN, so that the divergence is detected: after the bounds it would look like any other state.
     """
     if constrain is None:
         return None
     fill, entries = compiled_reader(positions, velocities), entries_type(len(names))
-    bounded = compiled_function(
+    constrain_state = compiled_function(
         constrain, names, "Task.state_names", named_tuple_type(entries), types.float64
     )
 
     @njit(nogil=True, error_model="numpy")
-    def keep(qpos: Any, qvel: Any, state: np.ndarray, timestep: float) -> None:
+    def apply_bounds(qpos: Any, qvel: Any, state: np.ndarray, timestep: float) -> None:
         fill(qpos, qvel, state)
-        if not is_fine(state):
+        if not is_finite_state(state):
             state[:] = np.nan
-        kept = to_floats(bounded(read_row(state, entries), timestep))
+        constrained = to_floats(constrain_state(read_row(state, entries), timestep))
         for entry in range(len(positions)):
-            qpos[entry] = kept[positions[entry]]
+            qpos[entry] = constrained[positions[entry]]
         for entry in range(len(velocities)):
-            qvel[entry] = kept[velocities[entry]]
+            qvel[entry] = constrained[velocities[entry]]
 
-    return keep
+    return apply_bounds
 
 
 @internal
-def is_fine(state: np.ndarray) -> bool:
-    """Whether every entry of a state (n,) is a number, and at most `LARGEST`."""
-    fine = True
+def is_finite_state(state: np.ndarray) -> bool:
+    """Return True if all entries of a state (n,) are numbers within `MAX_STATE`."""
+    is_valid = True
     for entry in range(len(state)):
-        fine &= abs(state[entry]) <= LARGEST
-    return fine
+        is_valid &= abs(state[entry]) <= MAX_STATE
+    return is_valid
 
 
 class Outcomes(NamedTuple):
-    """Compiled functions.
+    """Compiled functions of a task.
 
-    States are float64 arrays (n,). Observations are float32 arrays (k,); entries beyond the task's
-    own are left alone. `options` is the vector of the task's options.
+    States are float64 arrays (n,). Observations are float32 arrays (k,) whose entries beyond the
+    task's own are not written. `options` is the vector of the task's options.
     """
 
     observe: Compiled
-    """(state, observation) -> nothing: fills the observation."""
+    """(state, observation) -> None, which fills the observation."""
     reward: Compiled
-    """(state before, force delivered, state after, options) -> reward."""
+    """(state before, delivered force, state after, options) -> reward."""
     terminated: Compiled
-    """(state) -> whether the episode ends there."""
+    """(state) -> True if the episode ends in that state."""
 
 
 def compiled_outcomes(task: Task) -> Outcomes:
-    """The functions of a task; its own are compiled at once, ours as they are used, once a process."""
-    size, several = len(task.state_names), len(task.motors) > 1
+    """Return the compiled functions of a task; built-in ones compile on first use."""
+    size, has_several_motors = len(task.state_names), len(task.motors) > 1
     functions = task.observation, task.reward, task.terminated
-    return _compiled(*functions, task.options, size, task.observation_names, several)  # type: ignore[arg-type]
+    return _compiled(*functions, task.options, size, task.observation_names, has_several_motors)  # type: ignore[arg-type]
 
 
 @functools.cache
@@ -108,11 +108,14 @@ def _compiled(
     options_type: Any,
     size: int,
     names: tuple[str, ...],
-    several: bool,
+    has_several_motors: bool,
 ) -> Outcomes:
     compiled = njit(nogil=True, error_model="numpy")
     options_count, entries = len(options_type._fields), entries_type(size)
-    state, force = named_tuple_type(entries), types.float64[::1] if several else types.float64
+    state, force = (
+        named_tuple_type(entries),
+        types.float64[::1] if has_several_motors else types.float64,
+    )
     observation_of = compiled_function(observation, names, "Task.observation_names", state)
     reward_of = compiled_function(
         reward, "", "Task.reward", state, force, state, named_tuple_type(options_type)
@@ -121,19 +124,21 @@ def _compiled(
 
     @compiled
     def observe(state: np.ndarray, observation: np.ndarray) -> None:
-        seen = to_floats(observation_of(read_row(state, entries)))
-        for entry in range(len(seen)):
-            observation[entry] = seen[entry]
+        values = to_floats(observation_of(read_row(state, entries)))
+        for entry in range(len(values)):
+            observation[entry] = values[entry]
 
     @compiled
-    def rewarded(before: np.ndarray, force: Any, after: np.ndarray, options: np.ndarray) -> float:
-        options_given = options_type(*to_fixed_tuple(options, options_count))
+    def reward_after(
+        before: np.ndarray, force: Any, after: np.ndarray, options: np.ndarray
+    ) -> float:
+        option_tuple = options_type(*to_fixed_tuple(options, options_count))
         return float(
-            reward_of(read_row(before, entries), force, read_row(after, entries), options_given)
+            reward_of(read_row(before, entries), force, read_row(after, entries), option_tuple)
         )
 
     @compiled
-    def ended(state: np.ndarray) -> bool:
+    def is_terminated(state: np.ndarray) -> bool:
         return bool(terminated_at(read_row(state, entries)))
 
-    return Outcomes(observe, rewarded, ended)
+    return Outcomes(observe, reward_after, is_terminated)

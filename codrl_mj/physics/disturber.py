@@ -1,63 +1,65 @@
-"""Disturbs the commands and loads of many actuators, of one simulation or of many: the same compiled code."""
+"""Disturbances of commands and loads, compiled for one simulation and for many."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
 
-from codrl_mj.actuators.noise import philox, unit
+from codrl_mj.actuators.noise import philox, uniform
 from codrl_mj.compile_cache import njit
 from codrl_mj.disturbances import (
     KEY,
-    OFF,
+    NO_DISTURBANCES,
     PULSE_NAMES,
     Disturbances,
-    delayed,
+    interpolate_delayed,
+    limit_rate,
     pulse_load,
-    quantised,
-    rate_limited,
+    quantize,
     whole_and_fraction,
 )
 from codrl_mj.engine.memory import internal, read_row
 
-for _function in (delayed, quantised, rate_limited, philox, unit):
+for _function in (interpolate_delayed, quantize, limit_rate, philox, uniform):
     register_jitable(_function)
 
 
-class Numbers(NamedTuple):
-    """What a disturber does; zero is off."""
+class DisturberParameters(NamedTuple):
+    """Parameters of a disturber for one actuator; zero disables an effect."""
 
     timestep: float
     """Integration step [s]."""
     delay_steps: float
     """Delay in whole integration steps."""
     delay_fraction: float
-    """The rest of it."""
+    """Remaining fraction of an integration step."""
     quantum: float
-    """Of commands [N or N*m]."""
+    """Quantization step of commands [N or N*m]."""
     limit: float
     """Largest command [N or N*m]."""
     change: float
-    """Their largest change in an integration step [N or N*m]."""
+    """Largest change of the command in an integration step [N or N*m]."""
     pulse_force: float
     """Size of load pulses [N or N*m]."""
     pulse_duration: float
-    """[s]."""
+    """Duration of load pulses [s]."""
     pulse_interval: float
-    """Mean time between them [s]."""
-    hold: float
-    """Command [N or N*m] that holds the joint at a position of 1 m or rad; 0 where commands are no positions."""
+    """Mean time between pulses [s]."""
+    force_per_position: float
+    """Command [N or N*m] that corresponds to a position of 1 m or rad; 0 where commands are not
+    positions.
+    """
 
 
 _AFTER_HISTORY = 1 + len(PULSE_NAMES)
 
 
 class Disturber:
-    """What happens between the command and the physics, and the loads on the joint, once per integration step.
+    """Disturbances of the commands and loads on the joints, applied once per integration step.
 
-    All it remembers is the array `memory`, a row for each actuator of each simulation: commands on
-    their way (newest first), the last command that arrived, and the pulses'. What it does is
-    `numbers`, a row as in `Numbers` for each actuator of a simulation.
+    Its whole state is the array `memory`, with a row for each actuator of each simulation: delayed
+    commands (newest first), the last command that arrived, and the state of the pulses.
+    `parameters` has a row as in `DisturberParameters` for each actuator of a simulation.
     """
 
     def __init__(
@@ -66,20 +68,20 @@ class Disturber:
         timestep: float,
         limits: np.ndarray,
         simulations: int,
-        holds: np.ndarray | None = None,
+        force_per_position: np.ndarray | None = None,
     ) -> None:
-        """Start with nothing remembered, for a number of simulations at a timestep [s].
+        """Start with an empty memory, for a number of simulations at a timestep [s].
 
-        `limits`, shape (n,), are the largest forces [N or N*m] of the actuators of one, `holds`,
-        likewise, as in `Numbers`. Where all is off, commands arrive as they are, there are no
-        loads, and rows are empty.
+        `limits`, shape (n,), are the largest forces [N or N*m] of the actuators of one simulation,
+        and `force_per_position` is as in `DisturberParameters`. Without disturbances, commands
+        arrive unchanged, there are no loads, and rows are empty.
         """
-        self.on = disturbances != OFF
-        whole, fraction = whole_and_fraction(disturbances.command_delay, timestep)
+        self.enabled = disturbances != NO_DISTURBANCES
+        whole_steps, fraction = whole_and_fraction(disturbances.command_delay, timestep)
         rows = [
-            Numbers(
+            DisturberParameters(
                 timestep,
-                whole,
+                whole_steps,
                 fraction,
                 disturbances.command_quantum,
                 limit,
@@ -87,76 +89,88 @@ class Disturber:
                 disturbances.pulse_force,
                 disturbances.pulse_duration,
                 disturbances.pulse_interval,
-                hold,
+                ratio,
             )
-            for limit, hold in zip(
-                limits.tolist(), np.zeros(len(limits)) if holds is None else holds, strict=True
+            for limit, ratio in zip(
+                limits.tolist(),
+                np.zeros(len(limits)) if force_per_position is None else force_per_position,
+                strict=True,
             )
         ]
-        self.numbers = np.array(rows) if self.on else np.empty((len(rows), 0))
-        length = whole + 1 + (fraction > 0.0) + _AFTER_HISTORY if self.on else 0
+        self.parameters = np.array(rows) if self.enabled else np.empty((len(rows), 0))
+        length = whole_steps + 1 + (fraction > 0.0) + _AFTER_HISTORY if self.enabled else 0
         self.memory = np.zeros((simulations * len(rows), length))
 
     def reset(self, rows: np.ndarray, keys: Any, held: Any = 0.0) -> None:
-        """Forget everything at the start of episodes of m simulations, with these keys of random numbers.
+        """Clear the memory at the start of episodes of m simulations with these random keys.
 
-        Until the first command arrives, the commands `held` (m, n) [N or N*m] do.
+        Until the first command arrives, the commands are `held` (m, n) [N or N*m].
         """
-        count = len(self.numbers)
+        count = len(self.parameters)
         held = np.broadcast_to(held, (len(rows), count))
-        for actuator in range(count if self.on else 0):
+        for actuator in range(count if self.enabled else 0):
             self.memory[rows * count + actuator] = 0.0
             self.memory[rows * count + actuator, :KEY_COLUMN] = held[:, actuator, np.newaxis]
             self.memory[rows * count + actuator, KEY_COLUMN] = np.asarray(keys) + actuator
 
-    def disturbed(self, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The commands that arrive in the next step, and mean loads on the joints, [N or N*m], each of shape (N, n)."""
+    def disturb_commands(self, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the next step's commands and mean joint loads [N or N*m], each of shape (N, n)."""
         arrived, loads = desired, np.zeros(desired.shape)
-        if self.on:
-            arrived, plain = np.empty(desired.shape), np.ascontiguousarray(desired)
+        if self.enabled:
+            arrived, commands = np.empty(desired.shape), np.ascontiguousarray(desired)
             _disturb_each(
-                self.numbers, self.memory, *(one.reshape(-1) for one in (plain, arrived, loads))
+                self.parameters,
+                self.memory,
+                *(array.reshape(-1) for array in (commands, arrived, loads)),
             )
         return arrived, loads
 
 
 KEY_COLUMN = KEY - len(PULSE_NAMES)
-"""Where a row of a disturber's memory holds the key of the episode's random numbers, counted from its end."""
+"""Index of the episode's random key in a row of a disturber's memory, counted from the end."""
 
 
 _pulses = internal(pulse_load)
 
 
 @internal
-def disturb(numbers: Numbers, memory: np.ndarray, force: float) -> tuple[float, float]:
-    """The command that arrives in the next integration step, and the mean load over it; `memory` is an actuator's."""
+def disturb(
+    parameters: DisturberParameters, memory: np.ndarray, force: float
+) -> tuple[float, float]:
+    """Return an actuator's next command and its mean load over the step; `memory` is its row."""
     length = len(memory) - _AFTER_HISTORY
     for entry in range(length - 1, 0, -1):
         memory[entry] = memory[entry - 1]
     memory[0] = force
-    arrived = delayed(memory[int(numbers.delay_steps)], memory[length - 1], numbers.delay_fraction)
-    if numbers.quantum != 0.0:
-        arrived = quantised(arrived, numbers.quantum, numbers.limit)
-    if numbers.change != 0.0:
-        arrived = rate_limited(arrived, memory[length], numbers.change)
+    arrived = interpolate_delayed(
+        memory[int(parameters.delay_steps)], memory[length - 1], parameters.delay_fraction
+    )
+    if parameters.quantum != 0.0:
+        arrived = quantize(arrived, parameters.quantum, parameters.limit)
+    if parameters.change != 0.0:
+        arrived = limit_rate(arrived, memory[length], parameters.change)
         memory[length] = arrived
-    if numbers.pulse_force == 0.0:
+    if parameters.pulse_force == 0.0:
         return arrived, 0.0
-    own = memory[len(memory) - len(PULSE_NAMES) :]
+    pulse_memory = memory[len(memory) - len(PULSE_NAMES) :]
     load = _pulses(
-        own, numbers.timestep, numbers.pulse_force, numbers.pulse_duration, numbers.pulse_interval
+        pulse_memory,
+        parameters.timestep,
+        parameters.pulse_force,
+        parameters.pulse_duration,
+        parameters.pulse_interval,
     )
     return arrived, load
 
 
 @njit(nogil=True, error_model="numpy")
 def _disturb_each(
-    numbers: np.ndarray,
+    parameter_rows: np.ndarray,
     memory: np.ndarray,
     forces: np.ndarray,
     commands: np.ndarray,
     loads: np.ndarray,
 ) -> None:
     for row in range(len(memory)):
-        own = read_row(numbers[row % len(numbers)], Numbers)
-        commands[row], loads[row] = disturb(own, memory[row], forces[row])
+        parameters = read_row(parameter_rows[row % len(parameter_rows)], DisturberParameters)
+        commands[row], loads[row] = disturb(parameters, memory[row], forces[row])

@@ -1,4 +1,4 @@
-"""Puts actuators into a task's MJCF actuators, and reads them back."""
+"""Actuators in a task's MJCF model, for the control-callback backend."""
 
 import mujoco
 
@@ -12,8 +12,10 @@ from codrl_mj.tasks.base import INTEGRATORS
 from codrl_mj.user_code import asset_path
 
 
-def drive(target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float | None) -> None:
-    """Make an actuator of an `MjSpec` one of ours, at the control callback's door; an ideal one is a plain `<motor>`.
+def configure_actuator(
+    target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float | None
+) -> None:
+    """Configure an actuator of an `MjSpec` for the callback backend; an ideal one is a `<motor>`.
 
     Its gear, control, dynamics, gain and bias are overwritten. `max_force` limits the desired force
     [N] or torque [N*m] at the joint.
@@ -27,7 +29,7 @@ def drive(target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float 
     target.gaintype = mujoco.mjtGain.mjGAIN_FIXED
     target.gainprm = [float(ideal)] + [0.0] * (mujoco.mjNGAIN - 1)
     target.biastype = mujoco.mjtBias.mjBIAS_NONE if ideal else mujoco.mjtBias.mjBIAS_USER
-    target.userdata = [] if ideal else [*user_header(family), *actuator.numbers]
+    target.userdata = [] if ideal else [*user_header(family), *actuator.parameter_values]
 
 
 def hills(model: mujoco.MjModel) -> list[int]:
@@ -36,7 +38,7 @@ def hills(model: mujoco.MjModel) -> list[int]:
     Raises:
         ValueError: a joint carries our signature but not our layout.
     """
-    found = []
+    joints = []
     for index in range(model.njnt):
         user = model.jnt_user[index]
         if len(user) < 2 or tuple(user[:2]) != SIGNATURE:
@@ -52,31 +54,32 @@ def hills(model: mujoco.MjModel) -> list[int]:
             0.0,
         ]:
             raise ValueError(f'{name}: a hill of codrl_mj needs type="slide" and axis="1 0 0"')
-        found.append(index)
-    return found
+        joints.append(index)
+    return joints
 
 
 def needed_callbacks(model: mujoco.MjModel) -> tuple[str, ...]:
-    """The parts of our callbacks that a compiled model needs, as `codrl_mj.engine.install` takes them.
+    """Return the callbacks that a compiled model needs, as `codrl_mj.engine.install` takes them.
 
     Raises:
-        ValueError: an actuator or joint carries our signature but not our layout.
+        ValueError: the user data of an actuator or joint has our signature, but not our layout.
     """
-    called = [
-        index for index in motors(model) if model.actuator_plugin[index] < 0
-    ]  # the others are plugins
+    # Actuators of the plugin backend need no callback.
+    called = [index for index in motors(model) if model.actuator_plugin[index] < 0]
     return tuple(part for part, needed in (("motor", called), ("hill", hills(model))) if needed)
 
 
 def install_callbacks(model: mujoco.MjModel) -> None:
-    """Compile the families of a model's actuators, and install those of our callbacks that it needs, which may be none.
+    """Compile the families of a model's actuators, and install the callbacks that it needs.
+
+    A model without such actuators needs none.
 
     Args:
         model: any MuJoCo model.
 
     Raises:
-        ValueError: an actuator or joint carries our signature but not our layout.
-        CallbackInUseError: one of them is somebody else's; nothing was changed.
+        ValueError: the user data of an actuator or joint has our signature, but not our layout.
+        CallbackInUseError: another program installed a callback; nothing was changed.
     """
     for actuator in motors(model).values():
         engine.load_family(type(actuator))
@@ -85,56 +88,57 @@ def install_callbacks(model: mujoco.MjModel) -> None:
         engine.install(*parts)
 
 
-def task_model(plant: SimulationConfig) -> mujoco.MjModel:
-    """Compile a plant's model.
+def task_model(simulation: SimulationConfig) -> mujoco.MjModel:
+    """Compile the model of a simulation.
 
-    A diverging simulation is left to diverge, so that it can be reported, instead of being reset by
-    the engine. Where the Euler integrator is made explicit, joint damping is explicit too.
+    MuJoCo's automatic reset is disabled, so a diverging simulation diverges and can be reported.
+    With the explicit Euler integrator, joint damping is explicit, too.
     """
-    task = plant.task
+    task = simulation.task
     try:
         spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
     except ValueError as error:
         raise ValueError(f"{task.asset}: {' '.join(str(error).split())}") from error
-    if other := [name for name in task.integrators if INTEGRATORS[name] != spec.option.integrator]:
+    if others := [name for name in task.integrators if INTEGRATORS[name] != spec.option.integrator]:
         kind = mujoco.mjtIntegrator(spec.option.integrator).name.removeprefix("mjINT_")
         raise ValueError(
             f"{task.asset}: its <option> has integrator {kind}, so Task.integrators cannot have"
-            f" {', '.join(other)}"
+            f" {', '.join(others)}"
         )
-    spec.option.timestep = plant.timestep
+    spec.option.timestep = simulation.timestep
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    if plant.integrator == "euler":
+    if simulation.integrator == "euler":
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    joint = JointAdditions(plant.joint.armature, plant.joint.damping, plant.joint.friction)
+    joint = JointAdditions(
+        simulation.joint.armature, simulation.joint.damping, simulation.joint.friction
+    )
     for name, actuator, limit in zip(
-        task.motors, plant.actuators, plant.max_forces.tolist(), strict=True
+        task.motors, simulation.actuators, simulation.max_forces.tolist(), strict=True
     ):
         motor = spec.actuator(name)
         if motor is None:
-            there = ", ".join(repr(a.name) for a in spec.actuators) or "none"
+            names = ", ".join(repr(a.name) for a in spec.actuators) or "none"
             raise ValueError(
-                f"{task.asset} has no actuator {name!r}; there are {there}: rename it, or set"
-                " Task.motors"
+                f"{task.asset} has no actuator {name!r}; its actuators are {names}:"
+                " rename it, or set Task.motors"
             )
         joint_driven = (
             spec.joint(motor.target) if motor.trntype == mujoco.mjtTrn.mjTRN_JOINT else None
         )
-        if joint_driven is None or joint_driven.type not in _ALONG:
+        if joint_driven is None or joint_driven.type not in _SCALAR_JOINTS:
             raise ValueError(f"{task.asset}: actuator {name!r} must drive a hinge or a slide joint")
-        _check_plain(task.asset, spec.option, motor, joint_driven)
-        drive(motor, actuator, limit)
+        _check_direct_drive(task.asset, spec.option, motor, joint_driven)
+        configure_actuator(motor, actuator, limit)
         for added in (joint, actuator.additions):
             joint_driven.armature += added.armature
             joint_driven.damping[0] += added.damping
             if added.friction:
                 joint_driven.frictionloss += added.friction
                 spec.option.disableflags = flags_with_friction(spec.option.disableflags)
+    # The sky is ours to choose: without one, the background would be black.
     if all(texture.type != mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
         kind, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
-        sky = spec.add_texture(
-            type=kind, builtin=gradient, width=64, height=64
-        )  # ours: it would be drawn on black
+        sky = spec.add_texture(type=kind, builtin=gradient, width=64, height=64)
         sky.rgb1, sky.rgb2 = [0.93, 0.95, 0.97], [0.76, 0.82, 0.88]
     model = spec.compile()
     if (model.nq, model.nv) != (len(task.qpos), len(task.qvel)):
@@ -146,11 +150,11 @@ def task_model(plant: SimulationConfig) -> mujoco.MjModel:
     return model
 
 
-def _check_plain(
+def _check_direct_drive(
     asset: str, option: mujoco.MjOption, motor: mujoco.MjsActuator, joint: mujoco.MjsJoint
 ) -> None:
-    """Refuse what stands between a motor's force and the joint without being the actuator's: it would go unreported."""
-    between = {
+    """Raise if anything but our actuator changes the motor's force: it would go unreported."""
+    elements = {
         "its gear": (
             list(motor.gear) != [1, 0, 0, 0, 0, 0] and tuple(motor.userdata)[:2] != SIGNATURE
         ),
@@ -159,21 +163,21 @@ def _check_plain(
         "its group, which <option> disables": option.disableactuator >> motor.group & 1,
         f"the actuatorfrcrange of joint {joint.name!r}": any(joint.actfrcrange),
     }
-    for what in (what for what, there in between.items() if there):
+    for element in (element for element, is_set in elements.items() if is_set):
         raise ValueError(
-            f"{asset}: actuator {motor.name!r}: leave out {what}; gear and limits are the"
+            f"{asset}: actuator {motor.name!r}: leave out {element}; gear and limits are the"
             " actuator's, such as gear_ratio, arm_radius and max_current, and Task.max_force"
         )
 
 
-_ALONG = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def flags_with_friction(flags: int) -> int:
-    """The `disableflags` of a model whose joints have friction, from those of one whose joints have none.
+    """Return the `disableflags` for joints with friction, from those for joints without.
 
-    Friction is a constraint of MuJoCo's: for it the solver, which the models switch off, is
-    switched on, and starts from nothing at each step, so that a step depends on the state alone.
+    In MuJoCo friction is a constraint. It needs the solver, which the models disable. Warm starts
+    are disabled, so that a step depends on the state alone.
     """
     return flags & ~int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(
         mujoco.mjtDisableBit.mjDSBL_WARMSTART

@@ -1,4 +1,4 @@
-"""Many simulations of a task in MuJoCo at once: rows of arrays, stepped by threads."""
+"""Many simulations of a task in MuJoCo at once: rows of arrays, stepped by several threads."""
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,14 +9,20 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import USER_HEADER_SIZE
-from codrl_mj.physics.base import LARGEST, SimulationConfig, SimulationDivergedError
+from codrl_mj.physics.base import MAX_STATE, SimulationConfig, SimulationDivergedError
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.physics.mjcf import flags_with_friction
 from codrl_mj.physics.mujoco_single import MujocoPhysics
-from codrl_mj.physics.rows import Rows, derive_fields, lane, part
-from codrl_mj.physics.sharing import cpus, new_board, share
+from codrl_mj.physics.rows import Rows, derive_fields, make_lane, state_slice
+from codrl_mj.physics.sharing import new_board, num_cpus, run_shared
 from codrl_mj.physics.stepping import NOISE_KEY
-from codrl_mj.physics.variation import Variation, bare_model, field_of, mounting_of, write_fields
+from codrl_mj.physics.variation import (
+    Variation,
+    arms_and_additions,
+    bare_model,
+    field_of,
+    write_fields,
+)
 
 DERIVED = (
     *("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length"),
@@ -26,57 +32,65 @@ DERIVED = (
 
 
 class MujocoBatchPhysics:
-    """N simulations of one task, bit for bit those of N `MujocoPhysics`; states and signals are arrays.
+    """N simulations of one task, identical to N `MujocoPhysics` in every bit, as arrays.
 
-    Every simulation has its own actuators: parameters are per-simulation model fields.
+    Every simulation has its own actuators: parameters are model fields with a value per simulation.
     """
 
     def __init__(
         self,
-        plant: SimulationConfig,
+        simulation: SimulationConfig,
         actuators: Sequence[Sequence[ActuatorModel]],
         num_threads: int = 0,
     ) -> None:
-        """Compile the model and make the rows, one for each of N tuples of `actuators` in place of the plant's.
+        """Compile the model and make the rows, one for each of N tuples of `actuators`.
 
-        They are of its family; `num_threads` may be 0, for every CPU.
+        The actuators are of the family of those in `simulation`; `num_threads` = 0 uses all CPUs.
         """
-        self.plant, task = plant, plant.task
+        self.simulation, task = simulation, simulation.task
         self.num_envs, self._num_threads = len(actuators), num_threads
-        self._nominal = MujocoPhysics(plant)
+        self._nominal = MujocoPhysics(simulation)
         self._disturber = Disturber(
-            plant.disturbances, plant.timestep, plant.max_forces, self.num_envs, plant.holds
+            simulation.disturbances,
+            simulation.timestep,
+            simulation.max_forces,
+            self.num_envs,
+            simulation.force_per_position,
         )
         self._wiring = self._nominal.wiring
         self._positions, self._velocities = np.array(task.qpos), np.array(task.qvel)
         self._fields: dict[str, np.ndarray] = {}
-        self._rest = self._nominal.snapshot()  # a simulation just reset, motor at rest
+        # State of a simulation after a reset, with the motor at rest.
+        self._rest = self._nominal.snapshot()
         self._states = np.repeat(self._rest[np.newaxis], self.num_envs, axis=0)
         self._arms = np.ones((self.num_envs, len(task.motors)))
         self._bind()
-        every, (arms, additions) = np.arange(self.num_envs), mounting_of(actuators)
+        all_rows, (arms, additions) = np.arange(self.num_envs), arms_and_additions(actuators)
         self._arms[:] = arms
-        if any(
-            tuple(each) != plant.actuators for each in actuators
-        ):  # else the model has them, and no row needs to
+        # If all actuators are those of the model, no row needs parameters of its own.
+        if any(tuple(row) != simulation.actuators for row in actuators):
             self.set_parameters(
-                every, np.array([[one.numbers for one in each] for each in actuators]), arms
+                all_rows,
+                np.array([[actuator.parameter_values for actuator in row] for row in actuators]),
+                arms,
             )
         if (additions != additions[0]).any():
-            indices = [int(one.actuator) for one in self._wiring]
-            mounting = Variation(bare_model(task.name, plant.joint), motors=indices, mounting=True)
-            self.set_model(every, mounting.fields(np.empty((self.num_envs, 0)), additions))
+            indices = [int(wiring.actuator) for wiring in self._wiring]
+            variation = Variation(
+                bare_model(task.name, simulation.joint), motors=indices, vary_additions=True
+            )
+            self.set_model(all_rows, variation.fields(np.empty((self.num_envs, 0)), additions))
 
     def _bind(self) -> None:
-        """Make data for each thread, and the views that a step uses."""
-        threads = min(self._num_threads or cpus(), self.num_envs)
+        """Make the data of each thread, and the views that a step uses."""
+        threads = min(self._num_threads or num_cpus(), self.num_envs)
         self._data = [mujoco.MjData(copy.copy(self._nominal.model)) for _ in range(threads)]
         self.model, self.data = self._nominal.model, self._nominal.data
         self.stepping = self._nominal.stepping
         self._lanes: list[tuple[Any, ...]] = []
-        parts = {name: part(self.model, name) for name in ("time", "qpos", "qvel", "act")}
+        slices = {name: state_slice(self.model, name) for name in ("time", "qpos", "qvel", "act")}
         self._time, self._qpos, self._qvel, self._act = (
-            self._states[:, one] for one in parts.values()
+            self._states[:, state_part] for state_part in slices.values()
         )
         memory = self._disturber.memory
         self._rows = tuple(
@@ -84,14 +98,16 @@ class MujocoBatchPhysics:
         )
 
     def _lane(self) -> tuple[Any, ...]:
-        """The first thread's lane, when all are made for the fields of the models that differ at present."""
+        """Make all threads' lanes if model fields were added; return the first lane."""
         if not self._lanes:
-            self._lanes = [tuple(lane(self._nominal, data, self._fields)) for data in self._data]
+            self._lanes = [
+                tuple(make_lane(self._nominal, data, self._fields)) for data in self._data
+            ]
             self._steps: Any = None
         return self._lanes[0]
 
     def field(self, name: str) -> np.ndarray:
-        """A field of the model with a value for each simulation, shape (N, ...): live, to be written to."""
+        """Return a live array (N, ...) of a model field, with a value for each simulation."""
         if name not in self._fields:
             nominal = np.asarray(field_of(self.model, name))
             nominal = nominal.astype(np.int32) if nominal.dtype.kind == "i" else nominal
@@ -100,41 +116,54 @@ class MujocoBatchPhysics:
         return self._fields[name]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the simulations that threads step, and views."""
-        return {name: value for name, value in self.__dict__.items() if name not in _BOUND}
+        """Return everything except views and the simulations of threads."""
+        return {
+            name: value for name, value in self.__dict__.items() if name not in _REBUILT_ATTRIBUTES
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore, in this or another process."""
+        """Restore the object, in this or another process."""
         self.__dict__.update(state)
         self._bind()
 
-    def set_parameters(self, rows: np.ndarray, numbers: np.ndarray, arms: np.ndarray) -> None:
-        """Give m simulations other actuators: `numbers` (m, n, p), arms [m] (m, n); a reset of them follows.
+    def set_parameters(
+        self, rows: np.ndarray, parameter_values: np.ndarray, arms: np.ndarray
+    ) -> None:
+        """Set parameters (m, n, p) and arms [m] (m, n) of m simulations; then reset them.
 
-        What they add to their joints is the models': see `set_model`.
+        Quantities that they add to their joints belong to the models: see `set_model`.
         """
-        if not self.plant.motors_added:
+        if not self.simulation.motors_added:
             return
         user, gear, limits = map(
             self.field, ("actuator_user", "actuator_gear", "actuator_ctrlrange")
         )
-        for at, (one, limit) in enumerate(zip(self._wiring, self.plant.max_forces, strict=True)):
-            index, arm = int(one.actuator), arms[:, at]
-            user[rows, index, USER_HEADER_SIZE : USER_HEADER_SIZE + numbers.shape[2]] = numbers[
-                :, at
-            ]
-            gear[rows, self.model.actuator_outadr[index], 0] = 1.0 / arm
-            limits[rows, int(one.ctrl)] = np.stack([-limit * arm, limit * arm], axis=-1)
+        for motor_index, (wiring, limit) in enumerate(
+            zip(self._wiring, self.simulation.max_forces, strict=True)
+        ):
+            actuator, arm = int(wiring.actuator), arms[:, motor_index]
+            user[
+                rows, actuator, USER_HEADER_SIZE : USER_HEADER_SIZE + parameter_values.shape[2]
+            ] = parameter_values[:, motor_index]
+            gear[rows, self.model.actuator_outadr[actuator], 0] = 1.0 / arm
+            limits[rows, int(wiring.ctrl)] = np.stack([-limit * arm, limit * arm], axis=-1)
         self._arms[rows] = arms
 
     def set_model(self, rows: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
-        """Change fields of some simulations' models, as `Variation.fields` returns them, before these are reset."""
+        """Change model fields, as from `Variation.fields`, of simulations; then reset them."""
         for name, values in fields.items():
             self.field(name)[rows] = values
         if "dof_frictionloss" in fields:
-            rub, flags = fields["dof_frictionloss"].any(axis=1), self.model.opt.disableflags
-            self.field("opt.disableflags")[rows] = np.where(rub, flags_with_friction(flags), flags)
+            has_friction, flags = (
+                fields["dof_frictionloss"].any(axis=1),
+                self.model.opt.disableflags,
+            )
+            self.field("opt.disableflags")[rows] = np.where(
+                has_friction, flags_with_friction(flags), flags
+            )
         for name in DERIVED:
+            # MuJoCo derives further fields from those that changed. They are needed per simulation,
+            # too.
             self.field(name)
         derived = np.array([list(self._fields).index(name) for name in DERIVED])
         derive_fields(rows, self._lane(), derived)
@@ -142,7 +171,7 @@ class MujocoBatchPhysics:
     @property
     def state(self) -> np.ndarray:
         """Mechanical states in the task's order, shape (N, n), float64; a new array."""
-        state = np.empty((self.num_envs, len(self.plant.task.state_names)))
+        state = np.empty((self.num_envs, len(self.simulation.task.state_names)))
         state[:, self._positions], state[:, self._velocities] = self._qpos, self._qvel
         return state
 
@@ -151,74 +180,77 @@ class MujocoBatchPhysics:
         self._qpos[:], self._qvel[:] = states[:, self._positions], states[:, self._velocities]
 
     def models(self) -> Iterator[mujoco.MjModel]:
-        """One model, which has each simulation's fields in turn; what is only drawn is the first one's."""
+        """Yield one model with each simulation's fields in turn, except for visual fields."""
         model = copy.copy(self.model)
         for row in range(self.num_envs):
             write_fields(model, self._fields, row)
             yield model
 
     def reset(self, rows: np.ndarray, states: np.ndarray, keys: np.ndarray | float = 0.0) -> None:
-        """Start episodes of m simulations, from states (m, n) with keys (m,) of random numbers, motors at rest."""
-        self._nominal.install()  # raises if somebody replaced ours since the last episodes
+        """Start episodes of m simulations from states (m, n) with random keys (m,)."""
+        # Raises if another program replaced our callbacks since the last episodes.
+        self._nominal.install()
         self._states[rows] = self._rest
         self._qpos[rows], self._qvel[rows] = states[:, self._positions], states[:, self._velocities]
-        if self.plant.motors_added:
-            for at, one in enumerate(self._wiring):
-                self._act[rows, int(one.act) + NOISE_KEY] = keys + at
-        if self._disturber.on:
-            self._disturber.reset(rows, keys, self.plant.held(states))
+        if self.simulation.motors_added:
+            for motor_index, wiring in enumerate(self._wiring):
+                self._act[rows, int(wiring.act) + NOISE_KEY] = keys + motor_index
+        if self._disturber.enabled:
+            self._disturber.reset(rows, keys, self.simulation.holding_forces(states))
 
     def step(self, kernel: Any, steps: Any) -> bool:
-        """Take an environment step of every simulation; `kernel` is `Kernels.step_rows` of `codrl_mj.envs.compiled`.
+        """Take an environment step of every simulation; return True if any diverged.
 
-        Returns whether one of them is no longer one of numbers.
+        `kernel` is `Kernels.step_rows` of `codrl_mj.envs.compiled`.
         """
         self._lane()
-        if steps is not self._steps:  # who helps goes on with what it was first given
+        # Helping threads keep the arguments of the turn in which they joined, so new arguments need
+        # a new board.
+        if steps is not self._steps:
             self._steps, self._board = steps, new_board()
         arguments = self._rows, tuple(steps)
-        return share(
-            kernel, self._board, self._lanes, self.num_envs, self.plant.inner_steps, *arguments
+        return run_shared(
+            kernel, self._board, self._lanes, self.num_envs, self.simulation.inner_steps, *arguments
         )
 
     def observe(self, kernel: Any, rows: np.ndarray, observations: np.ndarray) -> None:
-        """Observe simulations where episodes start; `kernel` is `Kernels.observe_rows`."""
+        """Observe simulations whose episodes start; `kernel` is `Kernels.observe_rows`."""
         kernel(rows, self._lane(), self._rows, observations)
 
     @property
     def memory(self) -> np.ndarray:
-        """What the disturbances remember beside the engine's own state, a live array (N, k); (N, 0) if nothing."""
+        """State of the disturbances, a live array (N, k); (N, 0) without any."""
         return self._disturber.memory.reshape(self.num_envs, -1)
 
     def check_finite(self, states: np.ndarray, rows: np.ndarray) -> None:
-        """Raise if a state among `rows` (a mask, shape (N,)) left the finite numbers, naming the simulation."""
-        fine = np.abs(states) <= LARGEST
-        broken = np.flatnonzero(~fine.all(axis=1) & rows)
+        """Raise if a state in `rows`, a mask (N,), is not finite, with the simulation."""
+        is_valid = np.abs(states) <= MAX_STATE
+        broken = np.flatnonzero(~is_valid.all(axis=1) & rows)
         if len(broken) == 0:
             return
         first = broken[0]
-        entry = self.plant.task.state_names[int(np.argmin(fine[first]))]
-        value = states[first][np.argmin(fine[first])]
+        entry = self.simulation.task.state_names[int(np.argmin(is_valid[first]))]
+        value = states[first][np.argmin(is_valid[first])]
         raise SimulationDivergedError(
-            f"{self.plant.task.name}: {len(broken)} of {len(states)} simulations diverged;"
+            f"{self.simulation.task.name}: {len(broken)} of {len(states)} simulations diverged;"
             f" environment {first} at t = {self._time[first, 0]:g} s: {entry} = {value:g}. Reset"
             " them; if this repeats, shorten the integration step (inner_steps) or lower the gains"
         )
 
     def snapshot(self) -> np.ndarray:
-        """The whole state of every simulation, motor included, shape (N, k), float64."""
+        """Return the states of all simulations with their motors, shape (N, k), float64."""
         return self._states.copy()
 
     def restore(self, snapshot: np.ndarray) -> None:
-        """Continue from what `snapshot` returned."""
+        """Continue from the result of `snapshot`."""
         self._states[:] = snapshot
 
     def show(self, index: int) -> None:
-        """Bring `data` to the pose of one simulation, for drawing."""
+        """Move `data` to the pose of one simulation, for drawing."""
         self._nominal.show(self.state[index])
 
 
-_BOUND = (
+_REBUILT_ATTRIBUTES = (
     *("model", "data", "stepping", "_data", "_board", "_steps", "_lanes"),
     *("_time", "_qpos", "_qvel", "_act", "_rows"),
 )

@@ -1,4 +1,4 @@
-"""One simulation of a task in MuJoCo, the actuators in the control callback."""
+"""One simulation of a task in MuJoCo, with actuators in the control callback."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,35 +11,36 @@ from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import USER_HEADER_SIZE
 from codrl_mj.physics.base import Physics, SimulationConfig
 from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
-from codrl_mj.physics.stepping import Wiring, compiled_stepping, places_of
+from codrl_mj.physics.stepping import Wiring, compiled_stepping, make_pointer_table
 from codrl_mj.physics.variation import write_fields
 
 ARM = Wiring._fields.index("arm")
 
 
 class MujocoPhysics(Physics):
-    """A task's MJCF model and its data.
+    """MJCF model and data of a task.
 
-    One `mj_step` is one integration step. With CartPole's explicit Euler integrator the positions
-    are then moved by the old velocity instead of the new one, which for slide and hinge joints is
-    exactly Gymnasium's update. Where the task has bounds (`Task.constrain`), the state is put back
+    One `mj_step` is one integration step. CartPole's explicit Euler integrator then moves the
+    positions by the old velocity instead of the new one, which for slide and hinge joints is
+    exactly Gymnasium's update. If the task has bounds (`Task.constrain`), the state is moved back
     inside them after every integration step.
     """
 
-    def __init__(self, plant: SimulationConfig) -> None:
+    def __init__(self, simulation: SimulationConfig) -> None:
         """Compile the model and install the callbacks that it needs."""
-        super().__init__(plant)
-        self.model = task_model(plant)
+        super().__init__(simulation)
+        self.model = task_model(simulation)
         self.data = mujoco.MjData(self.model)
         self._flags = self.model.opt.disableflags
-        task = plant.task
+        task = simulation.task
         self._qpos_order, self._qvel_order = _progression(task.qpos), _progression(task.qvel)
         self.wiring: list[Wiring] = []
-        """Where the actuators' numbers are in the model."""
-        for name, actuator in zip(task.motors, plant.actuators, strict=True):
+        """Indices of the actuators' quantities in the model."""
+        for name, actuator in zip(task.motors, simulation.actuators, strict=True):
             index = self.model.actuator(name).id
             joint = self.model.actuator_trnid[index, 0]
             dof, qpos = self.model.jnt_dofadr[joint], self.model.jnt_qposadr[joint]
+            # Actuators without activations have the address -1.
             first = max(self.model.actuator_actadr[index], 0)
             self.wiring.append(
                 Wiring(
@@ -47,47 +48,51 @@ class MujocoPhysics(Physics):
                 )
             )
         self.settings = np.hstack(
-            [np.array(self.wiring, dtype=np.float64), self._disturber.numbers]
+            [np.array(self.wiring, dtype=np.float64), self._disturber.parameters]
         )
-        """See `codrl_mj.physics.stepping`, where `places` and `where`, too, are explained."""
+        """Settings as in `codrl_mj.physics.stepping`, which also explains `pointer_table` and
+        `pointers`.
+        """
         self._bind()
         self.reset(np.zeros(len(task.state_names)))
 
     def _bind(self) -> None:
-        """Take the views that a step uses, and make sure that the callbacks are there."""
+        """Take the views that a step uses, and ensure that the callbacks are installed."""
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
-        self.stepping = compiled_stepping(self.plant)
-        self.places = places_of(self.data, self.settings, self._disturber.memory, self.trace)
-        self.where = self.places.ctypes.data
+        self.stepping = compiled_stepping(self.simulation)
+        self.pointer_table = make_pointer_table(
+            self.data, self.settings, self._disturber.memory, self.trace
+        )
+        self.pointers = self.pointer_table.ctypes.data
         self.scene: tuple[Any, Any] | None = (self.model, self.data)
         self._callbacks = needed_callbacks(self.model)
         self.install()
 
     def install(self) -> None:
-        """Make sure that the callbacks are there; raises if somebody replaced them."""
+        """Ensure that the callbacks are installed; raise if others replaced them."""
         if self._callbacks:
             engine.install(*self._callbacks)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the views and the model, which a copy takes of its own data."""
+        """Return everything but the views and the model, which a copy takes from its data."""
         return {name: value for name, value in self.__dict__.items() if name not in _VIEWS}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore, in this or another process."""
+        """Restore the object, in this or another process."""
         self.__dict__.update(state)
-        self.model = (
-            self.data.model
-        )  # the one model of the copy: whoever changes either changes the simulation
+        # The copy of the data has its own copy of the model. Both must be the same object again, so
+        # that a changed model changes the simulation.
+        self.model = self.data.model
         self._bind()
 
     @property
     def time(self) -> float:  # type: ignore[override]
-        """Since the start of the episode [s]."""
+        """Time since the start of the episode [s]."""
         return self.data.time
 
     @property
     def state(self) -> np.ndarray:
-        """The mechanical state in the task's order, shape (n,), float64, as MuJoCo's data have it now; a new array."""
+        """Mechanical state in the task's order, shape (n,), float64; a new array."""
         state = np.empty(len(self._qpos) + len(self._qvel))
         state[self._qpos_order] = self._qpos
         state[self._qvel_order] = self._qvel
@@ -98,74 +103,90 @@ class MujocoPhysics(Physics):
         self._qpos[:], self._qvel[:] = state[self._qpos_order], state[self._qvel_order]
 
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
-        """See `Physics.reset`."""
-        self.install()  # raises if somebody replaced ours since the last episode
-        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), self.where)
+        """Start an episode; see `Physics.reset`."""
+        # Raises if another program replaced our callbacks since the last episode.
+        self.install()
+        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), self.pointers)
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
-        """Exchange the actuators for others of their family; to be followed by a reset.
+        """Replace the actuators by others of their family; a reset must follow.
 
-        What they add to their joints is the model's: see `set_model`.
+        Quantities that they add to their joints belong to the model: see `set_model`.
         """
-        if not self.plant.motors_added:
+        if not self.simulation.motors_added:
             return
-        for row, (one, limit) in enumerate(zip(actuators, self.plant.max_forces, strict=True)):
-            index, arm, numbers = int(self.wiring[row].actuator), one.arm_radius, one.numbers
-            self.model.actuator_user[index, USER_HEADER_SIZE : USER_HEADER_SIZE + len(numbers)] = (
-                numbers
+        for row, (actuator, limit) in enumerate(
+            zip(actuators, self.simulation.max_forces, strict=True)
+        ):
+            index, arm, parameter_values = (
+                int(self.wiring[row].actuator),
+                actuator.arm_radius,
+                actuator.parameter_values,
             )
+            parameters_end = USER_HEADER_SIZE + len(parameter_values)
+            self.model.actuator_user[index, USER_HEADER_SIZE:parameters_end] = parameter_values
             self.model.actuator_gear[self.model.actuator_outadr[index], 0] = 1.0 / arm
             self.model.actuator_ctrlrange[int(self.wiring[row].ctrl)] = -limit * arm, limit * arm
             self.settings[row, ARM] = arm
 
     def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
-        """Change fields of the model, as `Variation.fields` returns them for one simulation, before a reset."""
+        """Change fields of the model, named as in `Variation.fields`, before a reset."""
         write_fields(self.model, fields)
         if "dof_frictionloss" in fields:
-            rubs = fields["dof_frictionloss"].any()
-            self.model.opt.disableflags = flags_with_friction(self._flags) if rubs else self._flags
+            has_friction = fields["dof_frictionloss"].any()
+            self.model.opt.disableflags = (
+                flags_with_friction(self._flags) if has_friction else self._flags
+            )
         mujoco.mj_setConst(self.model, self.data)
 
     def show(self, state: np.ndarray) -> None:
-        """Bring the body poses up to date with `state`, for drawing; the motor and the episode are left alone."""
+        """Update the body poses for `state`, for drawing; motor and episode do not change."""
         self._qpos[:] = state[self._qpos_order]
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
-        mujoco.mj_passive(
-            self.model, self.data
-        )  # where there is a hill, its callback puts the car on it
+        # On a hill, the passive-force callback lifts the car to its height.
+        mujoco.mj_passive(self.model, self.data)
 
     def step(self, desired_force: Any) -> None:
-        """See `Physics.step`."""
-        if not self.stepping.step(desired_force, self.where):
+        """Take an environment step; see `Physics.step`."""
+        if not self.stepping.step(desired_force, self.pointers):
             self.check_finite()
 
-    def observed(self, row: np.ndarray) -> np.ndarray:
-        """See `Physics.observed`."""
-        seen = np.empty((len(row), len(self.plant.family.OBSERVED)))
-        self.stepping.observed(row, seen, self.where)
-        return seen
+    def read_sensors(self, row: np.ndarray) -> np.ndarray:
+        """Return the sensors' readings; see `Physics.read_sensors`."""
+        readings = np.empty((len(row), len(self.simulation.family.OBSERVED)))
+        self.stepping.read_sensors(row, readings, self.pointers)
+        return readings
 
     def snapshot(self) -> np.ndarray:
-        """Simulation and motor as the engine's state vector (`mjSTATE_INTEGRATION`), shape (k,), float64.
+        """Return simulation and motor as a vector (`mjSTATE_INTEGRATION`), float64.
 
-        `memory` and what `set_actuators` and `set_model` changed are not in it.
+        It does not include `memory` and changes by `set_actuators` and `set_model`.
         """
         vector = np.empty(mujoco.mj_stateSize(self.model, _STATE))
         mujoco.mj_getState(self.model, self.data, vector, _STATE)
         return vector
 
     def restore(self, snapshot: np.ndarray) -> None:
-        """Continue from what `snapshot` returned."""
+        """Continue from the result of `snapshot`."""
         mujoco.mj_setState(self.model, self.data, snapshot, _STATE)
 
 
 def _progression(entries: tuple[int, ...]) -> slice:
-    """The slice that selects `entries`, an arithmetic progression; numpy takes a fraction of a list's time for it."""
+    """Return an arithmetic progression as a slice, with which numpy is faster than with a list."""
     stride = entries[1] - entries[0] if len(entries) > 1 else 1
     return slice(entries[0], entries[-1] + 1, stride)
 
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_VIEWS = ("model", "_qpos", "_qvel", "stepping", "where", "places", "bound", "scene")
+_VIEWS = (
+    "model",
+    "_qpos",
+    "_qvel",
+    "stepping",
+    "pointers",
+    "pointer_table",
+    "bound_arrays",
+    "scene",
+)

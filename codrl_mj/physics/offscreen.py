@@ -1,4 +1,4 @@
-"""Drawing a MuJoCo model: off-screen, with errors that say what to do; and what was drawn in a window."""
+"""Rendering of a MuJoCo model off screen, with errors that name a remedy, and in a window."""
 
 import atexit
 import functools
@@ -16,21 +16,20 @@ from codrl_mj.fields import did_you_mean
 
 
 class RenderingUnavailableError(RuntimeError):
-    """No OpenGL context can be made on this machine, or in this process."""
+    """No OpenGL context can be created on this machine or in this process."""
 
 
 _open: "weakref.WeakSet[OffscreenRenderer]" = weakref.WeakSet()
-_fatal: list[
-    mujoco.FatalError
-] = []  # why there is no OpenGL in this process: another attempt would end it
+# The error after which this process cannot use OpenGL: another attempt would end the process.
+_fatal: list[mujoco.FatalError] = []
 
 
 @functools.cache
 def _watch_process() -> None:
-    """At exit free the contexts that nobody closed, while the OpenGL library is still there: later it complains.
+    """Free open contexts at exit while the OpenGL library is loaded; later it would complain.
 
-    To be called after the first context is made: the library registers its own shutdown then, and
-    the last one registered runs first. In a process forked off, contexts are made anew.
+    It must be called after the first context is created: the library registers its own shutdown
+    then, and the last function registered runs first. A forked process creates new contexts.
     """
 
     @atexit.register
@@ -38,20 +37,22 @@ def _watch_process() -> None:
         for renderer in list(_open):
             renderer.close()
 
-    if hasattr(os, "register_at_fork"):  # not on Windows
+    # Windows has no fork.
+    if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=_leave_to_parent)
 
 
 def _leave_to_parent() -> None:
-    """Let go of contexts and display after a fork: a software renderer's threads stayed behind, waiting for them hangs.
+    """Abandon contexts and display after a fork: waiting for the renderer's lost threads hangs.
 
-    A display on another platform has threads of its own. Where there is none, the inherited one has
-    to do.
+    A software renderer's threads stay in the parent process. A display of another platform has
+    threads of its own; if no other platform is available, the inherited display is used.
     """
     egl: Any = sys.modules.get("mujoco.egl")
     if egl is None:
         return
     atexit.unregister(egl.EGL.eglTerminate)
+    # PyOpenGL raises its own errors, and only the EGL backend needs it.
     for renderer in list(_open):
         _abandon(renderer._renderer)
         renderer._renderer = None
@@ -60,7 +61,7 @@ def _leave_to_parent() -> None:
             egl.EGL.eglGetPlatformDisplayEXT(_EGL_PLATFORM_SURFACELESS, None, None)
             or egl.EGL_DISPLAY
         )
-    except Exception:  # of PyOpenGL, which only the EGL backend needs
+    except Exception:
         return
 
 
@@ -68,11 +69,11 @@ _EGL_PLATFORM_SURFACELESS = 0x31DD
 
 
 class OffscreenRenderer:
-    """Draws a model into RGB arrays.
+    """Renderer of a model into RGB arrays.
 
     By default shadows, reflections and multisampling are off: on a CPU renderer they cost ten times
-    the rest. What is left goes for the larger part into the sky, which is drawn once for each pose
-    of the camera.
+    as much as everything else. Most of the remaining time is spent on the sky, which is drawn once
+    for each pose of the camera.
     """
 
     def __init__(
@@ -83,18 +84,18 @@ class OffscreenRenderer:
         camera: str = "fixed",
         pretty: bool = False,
     ) -> None:
-        """Make the OpenGL context.
+        """Create the OpenGL context.
 
         Args:
-            model: the model to draw.
+            model: model to draw.
             width: image width [px], at most the model's `offwidth`.
             height: image height [px], at most the model's `offheight`.
             camera: name of a camera of the model.
-            pretty: shadows, reflections and multisampling, for stills.
+            pretty: shadows, reflections and multisampling, for still images.
 
         Raises:
             ValueError: unknown camera, or a size out of bounds.
-            RenderingUnavailableError: no OpenGL context can be made.
+            RenderingUnavailableError: no OpenGL context can be created.
         """
         check_view(model, width, height, camera)
         self._camera = camera
@@ -103,26 +104,26 @@ class OffscreenRenderer:
         model.vis.quality.shadowsize = 4096 if pretty else 0
         self._model, self._size = model, (int(width), int(height))
         self._sky: tuple[bytes, np.ndarray] = (b"", np.empty(0))
-        self._sky_apart = not pretty and _only_sky_is_black(model)
+        self._reuses_sky = not pretty and _only_sky_is_black(model)
         self._renderer: mujoco.Renderer | None = self._make()
         _open.add(self)
         _watch_process()
 
     def _make(self) -> mujoco.Renderer:
-        """With a frame buffer no larger than the image: all of it is cleared for each."""
+        """Create the renderer; its frame buffer has the image's size to clear no more."""
         egl: Any = sys.modules.get("mujoco.egl")
         limits, (width, height) = self._model.vis.global_, self._size
         largest = limits.offwidth, limits.offheight
+        # Each backend raises its own errors, most of which are not exported.
         try:
-            if (
-                egl is not None and egl.EGL_DISPLAY
-            ):  # MuJoCo makes it once, but SDL (pygame) ends it with its window
+            # MuJoCo initializes the display once, but SDL (pygame) terminates it with its window.
+            if egl is not None and egl.EGL_DISPLAY:
                 egl.EGL.eglInitialize(egl.EGL_DISPLAY, None, None)
             limits.offwidth, limits.offheight = self._size
             if _fatal:
                 raise _fatal[0]
             return mujoco.Renderer(self._model, height=height, width=width)
-        except Exception as error:  # each backend raises its own kind, most of them not exported
+        except Exception as error:
             if (
                 not _fatal
                 and isinstance(error, mujoco.FatalError)
@@ -140,13 +141,14 @@ class OffscreenRenderer:
             limits.offwidth, limits.offheight = largest
 
     def render(self, data: mujoco.MjData) -> np.ndarray:
-        """Draw the data's present positions (their kinematics must be up to date).
+        """Draw the present positions of the data, whose kinematics must be up to date.
 
         Returns:
             Image, shape (height, width, 3), uint8.
 
         Raises:
-            RenderingUnavailableError: somebody ended the OpenGL context, and no other can be made.
+            RenderingUnavailableError: another program ended the OpenGL context, and no new one can
+                be created.
         """
         if self._renderer is None or not _make_current(self._renderer):
             self.close()
@@ -155,13 +157,15 @@ class OffscreenRenderer:
         flags = self._renderer.scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._pretty
         flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self._pretty
-        if not self._sky_apart:
+        if not self._reuses_sky:
             return self._renderer.render()
         scene = self._renderer.scene
         view = bytes(
             np.concatenate([np.append(camera.forward, camera.up) for camera in scene.camera])
         )
-        if view != self._sky[0]:  # what the camera sees where there is nothing
+        # The first image of a camera pose shows the sky alone. Later images take their black pixels
+        # from it.
+        if view != self._sky[0]:
             scene.ngeom, count = 0, scene.ngeom
             self._sky = view, self._renderer.render()
             scene.ngeom = count
@@ -172,15 +176,18 @@ class OffscreenRenderer:
         return image
 
     def close(self) -> None:
-        """Free the OpenGL context; harmless when repeated, or when somebody ended the context."""
+        """Free the OpenGL context; harmless if repeated or already ended elsewhere."""
         renderer, self._renderer = getattr(self, "_renderer", None), None
         if renderer is None:
             return
-        try:  # in its own context: in another's, the same names are that one's buffers
+        # Buffers are freed in their own context: in another context the same names belong to other
+        # buffers. If its display has ended, the context may still become current, but cannot be
+        # freed.
+        try:
             current = _make_current(renderer)
             if current:
                 renderer.close()
-        except Exception:  # it could still be made current, but not be freed: its display has ended
+        except Exception:
             current = False
         if not current:
             _abandon(renderer)
@@ -191,9 +198,9 @@ class OffscreenRenderer:
 
 
 def _only_sky_is_black(model: mujoco.MjModel) -> bool:
-    """Whether of a picture without sky only the sky's pixels have a colour of 0.
+    """Return True if a picture without sky is black (0) only where the sky would be.
 
-    All else is lit by the headlight's ambient part, opaque, and has no picture on it.
+    Everything else must be lit by the headlight's ambient part, be opaque, and have no texture.
     """
     light = model.vis.headlight
     colours = np.vstack([model.geom_rgba, model.site_rgba, model.mat_rgba])
@@ -206,26 +213,31 @@ def _only_sky_is_black(model: mujoco.MjModel) -> bool:
 
 
 def _make_current(renderer: mujoco.Renderer) -> bool:
-    """Make a renderer's context the thread's; False if it is no more."""
+    """Make a renderer's context current in this thread; return False if it is gone."""
     try:
+        # Each backend raises its own errors.
         if renderer._gl_context is not None:
             renderer._gl_context.make_current()
-    except Exception:  # each backend raises its own kind
+    except Exception:
         return False
     return True
 
 
 def _abandon(renderer: mujoco.Renderer | None) -> None:
-    """Let go of a renderer whose context is no more, or another process's."""
+    """Abandon a renderer whose context no longer exists or belongs to another process."""
     egl: Any = sys.modules.get("mujoco.egl")
     if egl is not None and renderer is not None:
-        egl.EGL.eglReleaseThread()  # without any context, freeing its buffers frees nobody else's
+        # Without a current context, freeing the renderer's buffers cannot free those of others.
+        egl.EGL.eglReleaseThread()
         renderer._gl_context._context = None
         renderer.close()
 
 
 def check_view(model: mujoco.MjModel, width: int, height: int, camera: str) -> None:
-    """Check that a model can be drawn so, without making an OpenGL context; the arguments are `OffscreenRenderer`'s."""
+    """Raise if a model cannot be drawn with these arguments of `OffscreenRenderer`.
+
+    No OpenGL context is created.
+    """
     for name, value, largest in (
         ("width", width, model.vis.global_.offwidth),
         ("height", height, model.vis.global_.offheight),
@@ -245,10 +257,10 @@ def check_view(model: mujoco.MjModel, width: int, height: int, camera: str) -> N
 
 
 class Window:
-    """Shows images one after another, no faster than a frame rate."""
+    """Window that shows images one after another, no faster than a frame rate."""
 
     def __init__(self, width: int, height: int) -> None:
-        """Open it, for images of a size [px]."""
+        """Open a window for images of a size [px]."""
         try:
             import pygame
         except ImportError:
@@ -261,12 +273,12 @@ class Window:
         self._clock = pygame.time.Clock()
 
     def show(self, image: np.ndarray, rate: float) -> None:
-        """Show an image (height, width, 3), uint8, at most at a rate [1/s]: waits as long as it must."""
+        """Show an image (height, width, 3), uint8, at most at a rate [1/s]."""
         self._screen.blit(self._pygame.surfarray.make_surface(image.swapaxes(0, 1)), (0, 0))
         self._pygame.event.pump()
         self._clock.tick(rate)
         self._pygame.display.flip()
 
     def close(self) -> None:
-        """Close it."""
+        """Close the window."""
         self._pygame.display.quit()

@@ -1,8 +1,8 @@
 """Threads that share the rows of a batch, step after step.
 
-One thread leads: it begins a turn, takes part in it and ends it. Others help: they look out for
-turns in compiled code, where none of them needs the interpreter, and sleep when none has begun for
-a while. They meet at a board of the batch.
+One thread leads: it begins a turn, takes part in it and ends it. The others help: they wait for
+turns in compiled code, where they do not need the interpreter, and sleep if no turn started for a
+while. The threads communicate through a board of counters for each batch.
 """
 
 import atexit
@@ -21,31 +21,31 @@ from codrl_mj.compile_cache import external_function, njit
 from codrl_mj.engine.memory import atomic_add, atomic_load, internal
 from codrl_mj.physics.compiled_task import Compiled
 
-_WORTH_WAKING = 64
-"""Integration steps of a thread's that are worth waking it."""
-_PATIENCE, _AT_ONCE = 1000, 500
-"""How often a thread looks for the next turn before it sleeps: about a millisecond; and before it
-offers its CPU to those who have none.
+_MIN_STEPS_PER_THREAD = 64
+"""Integration steps per thread from which waking another thread pays off."""
+_ROUNDS_BEFORE_SLEEP, _LOOKS_PER_ROUND = 1000, 500
+"""Number of rounds in which a thread looks for the next turn before it sleeps, about a millisecond
+in total, and of looks in a round, after which it yields its CPU.
 """
-_offer_cpu = external_function(
+_yield_cpu = external_function(
     "offer_cpu",
     ctypes.windll.kernel32.SwitchToThread if os.name == "nt" else ctypes.CDLL(None).sched_yield,  # type: ignore[attr-defined]
     types.int32(),
 )
 CLAIMED, BROKEN, TURN, HELPING = range(0, 32, 8)
-"""What a board counts, a cache line each: rows that were taken, simulations no longer of numbers,
-turns that began and that ended (so it is odd while one goes on), and threads that help in the
-present one.
+"""Indices of a board's counters, each in its own cache line: rows claimed, simulations that
+diverged, turns started plus turns ended (odd during a turn), and threads that help in the present
+turn.
 """
 
 
-def cpus() -> int:
-    """How many CPUs this process may use."""
+def num_cpus() -> int:
+    """Return the number of CPUs that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def apart(array: np.ndarray) -> np.ndarray:
-    """A copy on cache lines of its own: what threads write in turn would slow them down severalfold."""
+def cache_aligned_copy(array: np.ndarray) -> np.ndarray:
+    """Return a copy on its own cache lines; writes to shared lines are several times slower."""
     room = np.empty(array.nbytes + 128, np.uint8)
     start = -room.ctypes.data % 64
     copy = room[start : start + array.nbytes].view(array.dtype).reshape(array.shape)
@@ -54,94 +54,96 @@ def apart(array: np.ndarray) -> np.ndarray:
 
 
 def new_board() -> np.ndarray:
-    """Where threads meet that share the rows of one batch."""
-    return apart(np.zeros(32, np.int64))
+    """Return a new board, the counters of the threads that share a batch."""
+    return cache_aligned_copy(np.zeros(32, np.int64))
 
 
 @internal
-def _counted(board: np.ndarray, entry: int, more: int) -> int:
-    """Count so many more; returns what was counted before."""
-    return atomic_add(board[entry:].ctypes.data, more)
+def _add(board: np.ndarray, entry: int, increment: int) -> int:
+    """Add to a counter atomically; return its previous value."""
+    return atomic_add(board[entry:].ctypes.data, increment)
 
 
 @internal
-def _seen(board: np.ndarray, entry: int) -> int:
-    """What is counted at present."""
+def _read(board: np.ndarray, entry: int) -> int:
+    """Return a counter's present value."""
     return atomic_load(board[entry:].ctypes.data)
 
 
 @internal
-def _alone(board: np.ndarray) -> None:
-    """Wait until nobody helps."""
+def _wait_for_helpers(board: np.ndarray) -> None:
+    """Wait until no thread helps."""
     looks = 0
-    while _seen(board, HELPING):
+    while _read(board, HELPING):
         looks += 1
-        if looks % _AT_ONCE == 0:
-            _offer_cpu()
+        if looks % _LOOKS_PER_ROUND == 0:
+            _yield_cpu()
 
 
 @internal
-def _begun(board: np.ndarray) -> int:
-    """Begin a turn."""
+def _begin_turn(board: np.ndarray) -> int:
+    """Begin a turn; return its number."""
     board[CLAIMED] = board[BROKEN] = 0
-    return _counted(board, TURN, 1) + 1
+    return _add(board, TURN, 1) + 1
 
 
 @internal
-def _joined(board: np.ndarray, last: int) -> int:
-    """The turn that a thread now helps in, other than its last; 0 if none began in a short while."""
-    for _ in range(_PATIENCE):
-        for _ in range(_AT_ONCE):
-            turn = _seen(board, TURN)
+def _join_turn(board: np.ndarray, last: int) -> int:
+    """Join a turn other than the last one as a helper; return 0 if none starts in time."""
+    for _ in range(_ROUNDS_BEFORE_SLEEP):
+        for _ in range(_LOOKS_PER_ROUND):
+            turn = _read(board, TURN)
             if turn % 2 == 1 and turn != last:
-                _counted(board, HELPING, 1)
-                if _seen(board, TURN) == turn:
+                # The turn may end between the two looks: then the thread must not count as a
+                # helper.
+                _add(board, HELPING, 1)
+                if _read(board, TURN) == turn:
                     return turn
-                _counted(board, HELPING, -1)  # it had ended
-        _offer_cpu()
+                _add(board, HELPING, -1)
+        _yield_cpu()
     return 0
 
 
-def shared(do: Compiled) -> Compiled:
-    """What shares rows: (whether it leads, board, rows, threads, lane, arguments) -> nothing.
+def make_shared_kernel(function: Compiled) -> Compiled:
+    """Return a kernel (leads, board, rows, threads, lane, arguments) -> None that shares rows.
 
-    It leads one turn; or it helps in turns as they come, until none has begun in a short while.
-    `do` is a compiled function (first row, last and past it, lane, *arguments) -> simulations no
-    longer of numbers. Threads claim rows until there are none left, fewer the fewer are left:
-    nobody waits long for another, or at all for one that is late.
+    A leader leads one turn; a helper helps in turns until none starts in a short while. `function`
+    is a compiled function (first row, end row, lane, *arguments) -> number of simulations that
+    diverged. Threads claim rows until none are left, in smaller portions as fewer are left: no
+    thread waits long for another one, and a late thread delays no other.
     """
 
     @internal
     def work(board: np.ndarray, count: int, threads: int, lane: Any, arguments: Any) -> None:
         first = 0
         while first < count:
-            left = count - _seen(board, CLAIMED)
-            more = count if threads == 1 else max(1, left // (4 * threads))
-            first = _counted(board, CLAIMED, more)
+            remaining = count - _read(board, CLAIMED)
+            claimed = count if threads == 1 else max(1, remaining // (4 * threads))
+            first = _add(board, CLAIMED, claimed)
             if first < count:
-                _counted(board, BROKEN, do(first, min(first + more, count), lane, *arguments))
+                _add(board, BROKEN, function(first, min(first + claimed, count), lane, *arguments))
 
     @njit(nogil=True, error_model="numpy")
     def take_part(
         leads: bool, board: np.ndarray, count: int, threads: int, lane: Any, arguments: Any
     ) -> None:
-        turn = _begun(board) if leads else _joined(board, 0)
+        turn = _begin_turn(board) if leads else _join_turn(board, 0)
         while turn:
             work(board, count, threads, lane, arguments)
-            _counted(board, TURN if leads else HELPING, 1 if leads else -1)
-            turn = 0 if leads else _joined(board, turn)
+            _add(board, TURN if leads else HELPING, 1 if leads else -1)
+            turn = 0 if leads else _join_turn(board, turn)
         if leads:
-            _alone(board)
+            _wait_for_helpers(board)
 
     return take_part
 
 
 class _Worker:
-    """A thread that helps others, one batch at a time."""
+    """Thread that helps with one batch at a time."""
 
     def __init__(self) -> None:
         self.board: np.ndarray | None = None
-        """Of the batch that it helps with, or was last asked to."""
+        """Board of the batch that it helps with or was last asked to help with."""
         self.tasks: SimpleQueue[Any] = SimpleQueue()
         self.thread = threading.Thread(target=self._work, daemon=True)
         self.thread.start()
@@ -149,27 +151,30 @@ class _Worker:
     def _work(self) -> None:
         while (task := self.tasks.get()) is not None:
             function, board, *arguments = task
-            with contextlib.suppress(Exception):  # before it helps; whoever leads meets the same
+            # An error occurs before the thread helps, and the leader meets the same error.
+            with contextlib.suppress(Exception):
                 function(False, board, *arguments)
             if self.board is board:
                 self.board = None
-            del task, board, arguments  # which would be kept for as long as it sleeps
+            # Otherwise the arguments would stay alive while the thread sleeps.
+            del task, board, arguments
 
 
 _WORKERS: list[_Worker] = []
+# Threads do not survive a fork.
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_WORKERS.clear)  # threads do not survive it
+    os.register_at_fork(after_in_child=_WORKERS.clear)
 
 
 @atexit.register
-def _dismiss() -> None:
-    """End the workers while there is an interpreter."""
+def _stop_workers() -> None:
+    """Stop the workers while the interpreter still runs."""
     for worker in _WORKERS:
         worker.tasks.put(None)
         worker.thread.join(1.0)
 
 
-def share(
+def run_shared(
     function: Compiled,
     board: np.ndarray,
     lanes: Sequence[Any],
@@ -177,20 +182,19 @@ def share(
     steps: int,
     *arguments: Any,
 ) -> bool:
-    """Do what is `shared` to so many rows, of `steps` integration steps each, on as many threads as there are lanes.
+    """Run a kernel of `make_shared_kernel` on rows of `steps` integration steps each.
 
-    Whoever has a board gives the same lanes and arguments with it each time. Returns whether a
-    simulation is no longer one of numbers.
+    There are at most as many threads as lanes. The same board always comes with the same lanes and
+    arguments. Returns True if a simulation diverged.
     """
-    threads = min(len(lanes), 1 + count * steps // _WORTH_WAKING)
-    for at in range(threads - 1):
-        if at == len(_WORKERS):
+    threads = min(len(lanes), 1 + count * steps // _MIN_STEPS_PER_THREAD)
+    for helper_index in range(threads - 1):
+        if helper_index == len(_WORKERS):
             _WORKERS.append(_Worker())
-        worker = _WORKERS[at]
-        if (
-            worker.board is not board and worker.tasks.empty()
-        ):  # it helps one batch of several that take turns
+        worker = _WORKERS[helper_index]
+        # A worker stays with its batch, so of several batches that take turns it helps only one.
+        if worker.board is not board and worker.tasks.empty():
             worker.board = board
-            worker.tasks.put((function, board, count, threads, lanes[at + 1], arguments))
+            worker.tasks.put((function, board, count, threads, lanes[helper_index + 1], arguments))
     function(True, board, count, threads, lanes[0], arguments)
     return bool(board[BROKEN])

@@ -1,9 +1,9 @@
-"""One environment step of one simulation in MuJoCo, compiled: the engine's step with what comes before and after it.
+"""Compiled environment step of one simulation in MuJoCo.
 
-A compiled function knows a simulation by one number, `where`: the address of its `Places`.
-`settings` has a row for each actuator, a `Wiring` and then a disturber's `Numbers`; `memory` is a
-disturber's, a row for each actuator; `trace` that of `Physics`. They are live: what changes them
-changes the simulation. What an environment has beside it, options and observation, is for
+Compiled functions get a simulation as one number, `pointers`: the address of its `PointerTable`.
+`settings` has a row for each actuator, a `Wiring` followed by `DisturberParameters`; `memory` is
+the disturber's, with a row for each actuator; `trace` is that of `Physics`. All of them are live:
+changing them changes the simulation. Options and observation belong to the environment, see
 `codrl_mj.envs.compiled`.
 """
 
@@ -17,7 +17,7 @@ from numba.extending import overload
 
 from codrl_mj.actuators import Family
 from codrl_mj.compile_cache import njit
-from codrl_mj.disturbances import OFF
+from codrl_mj.disturbances import NO_DISTURBANCES
 from codrl_mj.engine.families import (
     USER_HEADER_SIZE,
     SlotHeader,
@@ -29,17 +29,22 @@ from codrl_mj.engine.layout import DATA, MODEL, addresses, engine_function
 from codrl_mj.engine.memory import f64, i64, internal, read_row, stack_floats
 from codrl_mj.engine.model_access import user_address
 from codrl_mj.physics.base import SimulationConfig
-from codrl_mj.physics.compiled_task import Compiled, compiled_constrain, compiled_reader, is_fine
-from codrl_mj.physics.disturber import KEY_COLUMN, Numbers, disturb
+from codrl_mj.physics.compiled_task import (
+    Compiled,
+    compiled_constrain,
+    compiled_reader,
+    is_finite_state,
+)
+from codrl_mj.physics.disturber import KEY_COLUMN, DisturberParameters, disturb
 
 TORQUE, NOISE_KEY = SlotHeader._fields.index("torque"), SlotHeader._fields.index("noise_key")
 
 
 class Wiring(NamedTuple):
-    """Where an actuator's numbers are in MuJoCo's arrays, and its arm."""
+    """Indices of an actuator's quantities in MuJoCo's arrays, and its arm."""
 
     actuator: float
-    """Its index."""
+    """Index of the actuator."""
     ctrl: float
     """Index of its control."""
     act: float
@@ -47,19 +52,19 @@ class Wiring(NamedTuple):
     dof: float
     """Index of its joint's velocity."""
     arm: float
-    """[m]."""
+    """Arm [m]."""
     qpos: float
     """Index of its joint's position."""
 
 
-WIRING = len(Wiring._fields)
+NUM_WIRING = len(Wiring._fields)
 
 
-class Places(NamedTuple):
-    """Where a simulation is: an int64 array, which must live as long as it."""
+class PointerTable(NamedTuple):
+    """Addresses and sizes of a simulation: an int64 array that must live as long."""
 
     model: int
-    """An address, as the next six."""
+    """Address, like the next six entries."""
     data: int
     settings: int
     memory: int
@@ -67,71 +72,96 @@ class Places(NamedTuple):
     options: int
     observation: int
     actuators: int
-    """How many, and what the arrays have of each."""
-    of_settings: int
-    of_memory: int
+    """Number of actuators, followed by the lengths of their rows."""
+    settings_columns: int
+    memory_columns: int
     inner_steps: int
     columns: int
-    """Of the trace."""
+    """Number of columns of the trace."""
 
 
-def places_of(data: Any, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray) -> np.ndarray:
-    """The `Places` of a simulation, by its `MjData`; all of them are contiguous, and stay the caller's."""
-    each = (one.ctypes.data for one in (settings, memory, trace))
+def make_pointer_table(
+    data: Any, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray
+) -> np.ndarray:
+    """Return the `PointerTable` of a simulation; the contiguous arrays remain the caller's."""
+    addresses_of_arrays = (array.ctypes.data for array in (settings, memory, trace))
     sizes = *settings.shape, memory.shape[-1], len(trace), trace.shape[-1]
-    return np.array([*addresses(data), *each, 0, 0, *sizes], np.int64)
+    return np.array([*addresses(data), *addresses_of_arrays, 0, 0, *sizes], np.int64)
 
 
 @internal
-def simulation_at(where: int) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
-    """Addresses of model and data of the simulation at an address, settings, memory and trace."""
-    at = i64(where)
-    found = Places(
-        at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7], at[8], at[9], at[10], at[11]
+def simulation_at(pointers: int) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
+    """Return addresses of model and data, and the settings, memory and trace of a simulation."""
+    entries = i64(pointers)
+    table = PointerTable(
+        entries[0],
+        entries[1],
+        entries[2],
+        entries[3],
+        entries[4],
+        entries[5],
+        entries[6],
+        entries[7],
+        entries[8],
+        entries[9],
+        entries[10],
+        entries[11],
     )
-    settings = numba.carray(f64(found.settings), (found.actuators, found.of_settings))
-    memory = numba.carray(f64(found.memory), (found.actuators, found.of_memory))
-    trace = numba.carray(f64(found.trace), (found.inner_steps, found.actuators, found.columns))
-    return found.model, found.data, settings, memory, trace
+    settings = numba.carray(f64(table.settings), (table.actuators, table.settings_columns))
+    memory = numba.carray(f64(table.memory), (table.actuators, table.memory_columns))
+    trace = numba.carray(f64(table.trace), (table.inner_steps, table.actuators, table.columns))
+    return table.model, table.data, settings, memory, trace
 
 
-OPTIONS, OBSERVATION = Places._fields.index("options"), Places._fields.index("observation")
+OPTIONS, OBSERVATION = (
+    PointerTable._fields.index("options"),
+    PointerTable._fields.index("observation"),
+)
 
 
 class Stepping(NamedTuple):
-    """Compiled functions; `where` is that of the module's docstring."""
+    """Compiled functions; `pointers` is explained in the module's docstring."""
 
     step: Compiled
-    """(force, where) -> whether the state is still one of numbers within `LARGEST`: takes one
-    environment step under a desired force [N or N*m], or under several, an array (n,). What the
-    actuators did is in `trace`.
+    """(force, pointers) -> True if the state is valid, within `MAX_STATE`: takes one environment
+    step under a desired force [N or N*m], or an array (n,) of several. What the actuators did is in
+    `trace`.
     """
     start: Compiled
-    """(state (n,), key, where) -> nothing: starts an episode, as `Physics.reset` does."""
+    """(state (n,), key, pointers) -> None, which starts an episode like `Physics.reset`."""
     read: Compiled
-    """(state (n,), where) -> nothing: fills `state` with the present one."""
-    observed: Compiled
-    """(row of trace (n, c), seen (n, k), where) -> nothing: fills `seen` with what the sensors say at present."""
+    """(state (n,), pointers) -> None, which fills `state` with the present state."""
+    read_sensors: Compiled
+    """(row of trace (n, c), readings (n, k), pointers) -> None, which fills the sensors'
+    `readings`.
+    """
 
 
-def compiled_stepping(plant: SimulationConfig) -> Stepping:
-    """The functions for simulations of a plant; compiled as they are used, once a process."""
-    task, disturbed = plant.task, plant.disturbances != OFF
-    if plant.motors_added:
-        load_family(plant.family)
-    order, explicit = (task.qpos, task.qvel), plant.integrator == "euler"
-    kept = compiled_constrain(task.constrain, task.state_names, *order)
+def compiled_stepping(simulation: SimulationConfig) -> Stepping:
+    """Return the functions for simulations with these settings; each compiles on first use."""
+    task, disturbed = simulation.task, simulation.disturbances != NO_DISTURBANCES
+    if simulation.motors_added:
+        load_family(simulation.family)
+    order, explicit = (task.qpos, task.qvel), simulation.integrator == "euler"
+    constrain = compiled_constrain(task.constrain, task.state_names, *order)
     return _stepping(
-        kept, compiled_reader(*order), *order, explicit, disturbed, plant.family, plant.motors_added
+        constrain,
+        compiled_reader(*order),
+        *order,
+        explicit,
+        disturbed,
+        simulation.family,
+        simulation.motors_added,
     )
 
 
 def force_of(forces: Any, actuator: int) -> float:
-    """The force for an actuator: of an array, or the number itself."""
+    """Return the force for an actuator: an entry of an array, or the number itself."""
     return forces[actuator] if isinstance(forces, np.ndarray) else forces
 
 
-@overload(force_of)  # not inlined by numba, which would drop stores through pointers as dead code
+# An overload is not inlined by numba. Inlined, it would drop stores through pointers as dead code.
+@overload(force_of)
 def _force_of(forces, actuator):  # type: ignore[no-untyped-def]  # noqa: ARG001 - numba compares the arguments
     if isinstance(forces, types.Array):
         return lambda forces, actuator: forces[actuator]
@@ -140,7 +170,7 @@ def _force_of(forces, actuator):  # type: ignore[no-untyped-def]  # noqa: ARG001
 
 @functools.cache
 def _stepping(
-    keep: Compiled | None,
+    constrain: Compiled | None,
     read_state: Compiled,
     positions: tuple[int, ...],
     velocities: tuple[int, ...],
@@ -150,13 +180,13 @@ def _stepping(
     motors_added: bool,
 ) -> Stepping:
     engine_step, engine_reset = engine_function("mj_step"), engine_function("mj_resetData")
-    size, moving = len(positions) + len(velocities), len(positions)
+    size, num_positions = len(positions) + len(velocities), len(positions)
     first, count = signals_offset(family), len(family.Signals._fields)
     observe = compiled_observe(family) if family.OBSERVED else None
 
     @njit(nogil=True, error_model="numpy")
-    def step(force: Any, where: int) -> bool:
-        model, data, settings, memory, trace = simulation_at(where)
+    def step(force: Any, pointers: int) -> bool:
+        model, data, settings, memory, trace = simulation_at(pointers)
         timestep = MODEL.opt.timestep(model)
         qpos, qvel, ctrl, act = DATA.qpos(data), DATA.qvel(data), DATA.ctrl(data), DATA.act(data)
         state = numba.carray(stack_floats(size), size)
@@ -165,38 +195,38 @@ def _stepping(
                 wiring = read_row(settings[actuator], Wiring)
                 command = force_of(force, actuator)
                 if disturbed:
-                    numbers = read_row(settings[actuator, WIRING:], Numbers)
+                    numbers = read_row(settings[actuator, NUM_WIRING:], DisturberParameters)
                     command, DATA.qfrc_applied(data)[int(wiring.dof)] = disturb(
                         numbers, memory[actuator], command
                     )
                 ctrl[int(wiring.ctrl)] = command * wiring.arm
                 trace[inner, actuator, 0] = command
             if explicit:
-                for entry in range(moving):
+                for entry in range(num_positions):
                     state[entry] = qpos[entry] + timestep * qvel[entry]
             engine_step(model, data)
             if explicit:
-                for entry in range(moving):
+                for entry in range(num_positions):
                     qpos[entry] = state[entry]
-            if keep is not None:
-                keep(qpos, qvel, state, timestep)
+            if constrain is not None:
+                constrain(qpos, qvel, state, timestep)
             for actuator in range(len(settings)):
                 wiring = read_row(settings[actuator], Wiring)
                 row = trace[inner, actuator]
                 if motors_added:
-                    own = int(wiring.act)
-                    row[1] = act[own + TORQUE] / wiring.arm
+                    first_activation = int(wiring.act)
+                    row[1] = act[first_activation + TORQUE] / wiring.arm
                     for entry in range(count):
-                        row[2 + entry] = act[own + first + entry]
+                        row[2 + entry] = act[first_activation + first + entry]
                 else:
                     row[1] = row[0]
                 row[2 + count] = qvel[int(wiring.dof)]
         read_state(qpos, qvel, state)
-        return is_fine(state)
+        return is_finite_state(state)
 
     @njit(nogil=True, error_model="numpy")
-    def start(state: np.ndarray, key: float, where: int) -> None:
-        model, data, settings, memory, _ = simulation_at(where)
+    def start(state: np.ndarray, key: float, pointers: int) -> None:
+        model, data, settings, memory, _ = simulation_at(pointers)
         engine_reset(model, data)
         qpos, qvel = DATA.qpos(data), DATA.qvel(data)
         for entry in range(len(positions)):
@@ -209,22 +239,24 @@ def _stepping(
                     key + actuator
                 )
             if disturbed:
-                hold = read_row(settings[actuator, WIRING:], Numbers).hold
+                force_per_position = read_row(
+                    settings[actuator, NUM_WIRING:], DisturberParameters
+                ).force_per_position
                 position = qpos[int(read_row(settings[actuator], Wiring).qpos)]
                 memory[actuator] = 0.0
                 memory[actuator, : memory.shape[1] + KEY_COLUMN] = (
-                    hold * position if hold != 0.0 else 0.0
+                    force_per_position * position if force_per_position != 0.0 else 0.0
                 )
                 memory[actuator, memory.shape[1] + KEY_COLUMN] = key + actuator
 
     @njit(nogil=True, error_model="numpy")
-    def read(state: np.ndarray, where: int) -> None:
-        _, data, _, _, _ = simulation_at(where)
+    def read(state: np.ndarray, pointers: int) -> None:
+        _, data, _, _, _ = simulation_at(pointers)
         read_state(DATA.qpos(data), DATA.qvel(data), state)
 
     @njit(nogil=True, error_model="numpy")
-    def observed(row: np.ndarray, seen: np.ndarray, where: int) -> None:
-        model, data, settings, _, _ = simulation_at(where)
+    def read_sensors(row: np.ndarray, readings: np.ndarray, pointers: int) -> None:
+        model, data, settings, _, _ = simulation_at(pointers)
         if observe is not None:
             for actuator in range(len(settings)):
                 wiring = read_row(settings[actuator], Wiring)
@@ -234,7 +266,7 @@ def _stepping(
                     MODEL.opt.timestep(model),
                     DATA.time(data),
                     DATA.act(data)[int(wiring.act) + NOISE_KEY],
-                    seen[actuator].ctypes.data,
+                    readings[actuator].ctypes.data,
                 )
 
-    return Stepping(step, start, read, observed)
+    return Stepping(step, start, read, read_sensors)

@@ -1,4 +1,4 @@
-"""Many NumPy generators drawn from at once, each exactly as if it were alone."""
+"""Many NumPy generators, drawn from at once, with the same numbers as one by one."""
 
 import ctypes
 from collections.abc import Sequence
@@ -11,38 +11,41 @@ from numba import types
 from codrl_mj.compile_cache import external_function, njit
 
 WORDS = 6
-"""Numbers that hold one generator's state: PCG64's state and increment (two words each), and its spare 32 bits."""
+"""Length of a generator's state: state and increment of PCG64 (two words each), and its spare 32
+bits.
+"""
 _LOW = 2**64 - 1
 _next_double = external_function(
     "next_double",
     ctypes.cast(np.random.PCG64(0).ctypes.next_double, ctypes.c_void_p),
     types.float64(types.uintp),
 )
-"""(address of a generator's state) -> the next number in [0, 1); NumPy's own."""
+"""(address of a generator's state) -> the next number in [0, 1), by NumPy's own function."""
 
 
 @njit
 def _fill(addresses: np.ndarray, drawn: np.ndarray) -> None:
-    """Fill rows from the generators at the given addresses."""
+    """Fill rows with numbers from the generators at these addresses."""
     for row in range(len(addresses)):
         for column in range(drawn.shape[1]):
             drawn[row, column] = _next_double(addresses[row])
 
 
 class Streams:
-    """N independent `numpy.random.Generator`s; stream i draws what the i-th generator alone would draw.
+    """N independent `numpy.random.Generator`s that are drawn from at once.
 
-    The draws are NumPy's own: its `next_double` is called on each generator's state from compiled
-    code.
+    Stream i gives the same numbers as the i-th generator would alone: compiled code calls NumPy's
+    own `next_double` on each generator's state.
     """
 
     def __init__(self, size: int) -> None:
-        """Make `size` generators with seeds from the operating system."""
+        """Create `size` generators with seeds from the operating system."""
         self.generators = [seeding.np_random(None)[0] for _ in range(size)]
         self._bind()
 
     def _bind(self) -> None:
         addresses = [generator.bit_generator.ctypes.state_address for generator in self.generators]
+        # Copies and seeds replace the generators, so their addresses are read again.
         self._addresses = np.array(addresses, dtype=np.uintp)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -53,33 +56,36 @@ class Streams:
         self._bind()
 
     def seed(self, rows: np.ndarray, seeds: Sequence[int | None]) -> None:
-        """Seed the streams `rows` (m,) as Gymnasium seeds an environment; None leaves a stream as it is."""
+        """Seed the streams `rows` (m,) like Gymnasium; None leaves a stream unchanged."""
         for row, seed in zip(rows, seeds, strict=True):
             if seed is not None:
                 self.generators[row] = seeding.np_random(seed)[0]
         self._bind()
 
     def random(self, rows: np.ndarray, count: int) -> np.ndarray:
-        """The next `count` numbers in [0, 1) of each of the streams `rows` (m,), which are different: (m, count)."""
+        """Return the next numbers in [0, 1) of the streams `rows` (m,), shape (m, count).
+
+        The rows must be different.
+        """
         drawn = np.empty((len(rows), count))
         _fill(self._addresses[rows], drawn)
         return drawn
 
     def state(self) -> np.ndarray:
-        """Where every stream stands, shape (N, 6), uint64."""
+        """Return the states of all streams, shape (N, 6), uint64."""
         words = np.empty((len(self.generators), WORDS), dtype=np.uint64)
         for row, generator in zip(words, self.generators, strict=True):
-            row[:] = words_of(generator)
+            row[:] = generator_words(generator)
         return words
 
     def set_state(self, words: np.ndarray) -> None:
-        """Continue from what `state` returned."""
+        """Continue from the result of `state`."""
         for row, generator in zip(words, self.generators, strict=True):
-            set_words(generator, row)
+            set_generator_words(generator, row)
 
 
-def words_of(generator: np.random.Generator) -> np.ndarray:
-    """Where a generator stands, shape (6,), uint64."""
+def generator_words(generator: np.random.Generator) -> np.ndarray:
+    """Return the state of a generator, shape (6,), uint64."""
     pcg: Any = generator.bit_generator.state
     if pcg["bit_generator"] != "PCG64":
         raise ValueError(
@@ -97,8 +103,8 @@ def words_of(generator: np.random.Generator) -> np.ndarray:
     return np.array(words, dtype=np.uint64)
 
 
-def set_words(generator: np.random.Generator, words: np.ndarray) -> None:
-    """Let a PCG64 generator continue from what `words_of` returned."""
+def set_generator_words(generator: np.random.Generator, words: np.ndarray) -> None:
+    """Set the state of a PCG64 generator to a result of `generator_words`."""
     row = words.tolist()
     generator.bit_generator.state = {
         "bit_generator": "PCG64",

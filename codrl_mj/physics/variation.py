@@ -1,4 +1,4 @@
-"""Variations of a model, of many simulations at once: masses, lengths, gravity, damping, and what motors add to it."""
+"""Variations of model fields for many simulations: masses, lengths, gravity, damping, motors."""
 
 import copy
 import functools
@@ -9,89 +9,89 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import IDEAL, ActuatorModel
-from codrl_mj.disturbances import PLAIN, Joint
+from codrl_mj.disturbances import UNMODIFIED_JOINT, Joint
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics.base import SimulationConfig
 from codrl_mj.physics.mjcf import hills, task_model
 from codrl_mj.tasks import TASKS
 
-SHOWN = ("geom_pos", "geom_size")
-"""Fields that only pictures depend on."""
+VISUAL_FIELDS = ("geom_pos", "geom_size")
+"""Fields that affect only pictures."""
 _FIELDS = {
     "mass": ("body_mass", "body_inertia"),
-    "length": ("body_ipos", "body_inertia", "body_pos", *SHOWN),
+    "length": ("body_ipos", "body_inertia", "body_pos", *VISUAL_FIELDS),
     "damping": ("dof_damping",),
     "gravity": ("opt.gravity", "jnt_user"),
 }
-VARIED = tuple(
-    dict.fromkeys(name for names in _FIELDS.values() for name in names if name not in SHOWN)
+DYNAMIC_FIELDS = tuple(
+    dict.fromkeys(name for names in _FIELDS.values() for name in names if name not in VISUAL_FIELDS)
 )
-"""Fields that the dynamics depend on."""
+"""Fields that affect the dynamics."""
 
 
 class JointAddress(NamedTuple):
-    """Where a motor's share of one entry of its `JointAdditions` is in a model."""
+    """Address of the model entry to which a motor adds one of its `JointAdditions`."""
 
     field: str
-    """Of the model."""
-    place: int
-    """In it."""
+    """Name of the model field."""
+    field_index: int
+    """Index in the field."""
     scale: float
-    """The model's number is that many times the motor's."""
+    """Factor from the motor's value to the model's value."""
 
 
-def mounts_of(model: mujoco.MjModel, index: int) -> tuple[JointAddress | None, ...]:
-    """Where an actuator's additions go, entries as in `JointAdditions`; None where the model has no place for them.
+def joint_addresses(model: mujoco.MjModel, index: int) -> tuple[JointAddress | None, ...]:
+    """Return the addresses of an actuator's `JointAdditions`; None where the model has none.
 
-    Those of a motor in the control callback are its joint's; a plugin keeps gear, inertia and
-    damping to itself.
+    The additions of a motor in the control callback are those of its joint. A plugin's actuator has
+    its own gear, inertia and damping.
     """
-    kind, driven = mujoco.mjtTrn(model.actuator_trntype[index]), int(model.actuator_trnid[index, 0])
-    rubs: JointAddress | None = None
+    kind, target = mujoco.mjtTrn(model.actuator_trntype[index]), int(model.actuator_trnid[index, 0])
+    friction_address: JointAddress | None = None
     scale = abs(float(model.actuator_gear[model.actuator_outadr[index], 0]))
     if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
-        dof = int(model.jnt_dofadr[driven])
+        dof = int(model.jnt_dofadr[target])
         if model.actuator_plugin[index] < 0:
             return tuple(
                 JointAddress(f"dof_{name}", dof, 1.0)
                 for name in ("armature", "damping", "frictionloss")
             )
-        rubs = JointAddress("dof_frictionloss", dof, scale)
+        friction_address = JointAddress("dof_frictionloss", dof, scale)
     elif kind == mujoco.mjtTrn.mjTRN_TENDON:
-        rubs = JointAddress("tendon_frictionloss", driven, scale)
+        friction_address = JointAddress("tendon_frictionloss", target, scale)
     return (
         JointAddress("actuator_armature", index, 1.0),
         JointAddress("actuator_damping", index, 1.0),
-        rubs,
+        friction_address,
     )
 
 
 @functools.cache
-def bare_model(task: str, joint: Joint = PLAIN) -> mujoco.MjModel:
-    """The model of the task of a name, with nothing on its actuated joints but what is given; read only."""
+def bare_model(task: str, joint: Joint = UNMODIFIED_JOINT) -> mujoco.MjModel:
+    """Return the model of a task without actuators' additions; it must not be changed."""
     return task_model(
         SimulationConfig(TASKS[task], (IDEAL,) * len(TASKS[task].motors), joint=joint)
     )
 
 
 def without_motors(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> mujoco.MjModel:
-    """A copy of a model without what its motors, by the indices of their actuators, add to it."""
+    """Return a copy of a model without the additions of its motors, keyed by actuator index."""
     bare = copy.copy(model)
     for index, motor in motors.items():
-        for mount, added in zip(mounts_of(model, index), motor.additions, strict=True):
-            if mount is not None:
-                getattr(bare, mount.field)[mount.place] -= added * mount.scale
+        for address, addition in zip(joint_addresses(model, index), motor.additions, strict=True):
+            if address is not None:
+                getattr(bare, address.field)[address.field_index] -= addition * address.scale
     return bare
 
 
-def mounting_of(motors: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, np.ndarray]:
-    """The arms [m] of the motors of m simulations, (m, n), and their `JointAdditions`, (m, n, 3)."""
-    arms = np.array([[one.arm_radius for one in each] for each in motors])
-    return arms, np.array([[one.additions for one in each] for each in motors])
+def arms_and_additions(motors: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return arms [m], (m, n), and additions, (m, n, 3), of the motors of m simulations."""
+    arms = np.array([[motor.arm_radius for motor in row] for row in motors])
+    return arms, np.array([[motor.additions for motor in row] for row in motors])
 
 
-def variable(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Names of what can be varied of a model."""
+def variable_names(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Return the names of everything in a model that can be varied."""
     bodies = {
         body: model.body(body).name for body in range(1, model.nbody) if model.body(body).name
     }
@@ -103,7 +103,11 @@ def variable(model: mujoco.MjModel) -> tuple[str, ...]:
 
 
 def _has_length(model: mujoco.MjModel, body: int) -> bool:
-    """Whether a body turns about its joint, has its centre of mass on the z axis from there, and touches nothing."""
+    """Return True if `model.length.BODY` can scale a body.
+
+    Its joints must be hinges at its origin, its center of mass on its z axis, and it must not touch
+    anything.
+    """
     joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
     turns = all(
         model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_pos[joint].any()
@@ -113,24 +117,24 @@ def _has_length(model: mujoco.MjModel, body: int) -> bool:
     touches = (
         model.geom_contype | model.geom_conaffinity
     ).any() and not model.opt.disableflags & flags
-    held = touches or model.ntendon or model.neq
+    is_constrained = touches or model.ntendon or model.neq
     x, y, z = model.body_ipos[body]
     return (
         turns
         and bool(z)
         and x == y == 0.0
         and list(model.body_iquat[body]) == [1.0, 0.0, 0.0, 0.0]
-        and not held
+        and not is_constrained
     )
 
 
 class Variation:
-    """How numbers change the fields of a compiled model.
+    """Effect of numbers on the fields of a compiled model.
 
-    `model.mass.BODY` multiplies a body's mass and inertia, `model.length.BODY` all distances along
-    it (its centre of mass, what hangs on it, what is drawn of it) and, squared, its inertia about
-    the axes across it, `model.gravity` gravity and the force of a hill; `model.damping.JOINT` is
-    the damping [N*s/m or N*m*s/rad] added to a joint.
+    `model.mass.BODY` multiplies the body's mass and inertia. `model.length.BODY` multiplies all
+    distances along the body (its center of mass, attached bodies, its geoms) and, squared, its
+    inertia about the transverse axes. `model.gravity` multiplies gravity and the force of a hill.
+    `model.damping.JOINT` is a damping [N*s/m or N*m*s/rad] that is added to a joint.
     """
 
     def __init__(
@@ -138,19 +142,22 @@ class Variation:
         model: mujoco.MjModel,
         names: Sequence[str] = (),
         motors: Sequence[int] = (),
-        mounting: bool = False,
+        vary_additions: bool = False,
     ) -> None:
-        """Find the fields of what is varied, names of `variable(model)`.
+        """Find the fields that are varied by names of `variable_names(model)`.
 
-        `motors` are the indices of actuators whose additions are not in the model; `mounting`
+        `motors` are the indices of actuators whose additions are not in the model; `vary_additions`
         varies these, too.
         """
         self.names = tuple(names)
-        self._mounts = [mounts_of(model, index) for index in motors]
+        self._addresses = [joint_addresses(model, index) for index in motors]
         fields = [field for name in names for field in _FIELDS[name.split(".")[1]]]
         fields += [
-            mount.field for mounts in self._mounts for mount in mounts if mount is not None
-        ] * mounting
+            address.field
+            for addresses in self._addresses
+            for address in addresses
+            if address is not None
+        ] * vary_additions
         self._nominal = {field: field_of(model, field).copy() for field in fields}
         self._neutral = np.array([float(not name.startswith("model.damping.")) for name in names])
         self._bodies = {model.body(body).name: body for body in range(model.nbody)}
@@ -165,29 +172,30 @@ class Variation:
     def fields(
         self, values: np.ndarray, additions: np.ndarray | None = None, shown: bool = False
     ) -> dict[str, np.ndarray]:
-        """The varied fields of the model, by name (`opt.` before an option's), shape (m, ...).
+        """Return the varied fields, shape (m, ...), by name (`opt.` before an option's).
 
-        `values`, shape (m, k), has a column for each of `names`, NaN where it is as it was;
-        `additions` are as `mounting_of` has them; `shown` includes the fields that only pictures
-        depend on.
+        `values`, shape (m, k), has a column for each of `names`, NaN for the nominal value;
+        `additions` are as in `arms_and_additions`; `shown` includes the fields that affect only
+        pictures.
         """
         fields = {
             field: np.repeat(nominal[np.newaxis], len(values), axis=0)
+            # Damping is added and everything else multiplied, so the neutral values are 0 and 1.
             for field, nominal in self._nominal.items()
-            if shown or field not in SHOWN
+            if shown or field not in VISUAL_FIELDS
         }
         for name, column in zip(
             self.names, np.where(np.isnan(values), self._neutral, values).T, strict=True
         ):
             kind, _, target = name.removeprefix("model.").partition(".")
-            body, each = self._bodies.get(target), column[:, np.newaxis]
+            body, scale = self._bodies.get(target), column[:, np.newaxis]
             if kind == "mass":
                 fields["body_mass"][:, body] *= column
-                fields["body_inertia"][:, body] *= each
+                fields["body_inertia"][:, body] *= scale
             elif kind == "length":
-                fields["body_ipos"][:, body] *= each
-                fields["body_inertia"][:, body, :2] *= each**2
-                fields["body_pos"][:, self._parents == body] *= each[:, np.newaxis]
+                fields["body_ipos"][:, body] *= scale
+                fields["body_inertia"][:, body, :2] *= scale**2
+                fields["body_pos"][:, self._parents == body] *= scale[:, np.newaxis]
                 for geom in (
                     np.flatnonzero(self._geom_bodies == body).tolist()
                     if "geom_pos" in fields
@@ -197,43 +205,46 @@ class Variation:
                     if geom in self._geoms_along:
                         fields["geom_size"][:, geom, self._geoms_along[geom]] *= column
             elif kind == "damping":
-                fields["dof_damping"][:, self._dofs[target]] += each
+                fields["dof_damping"][:, self._dofs[target]] += scale
             else:
-                fields["opt.gravity"] *= each
+                fields["opt.gravity"] *= scale
                 for joint in self._hills:
                     fields["jnt_user"][:, joint, GRAVITY] *= column
-        for motor, mounts in enumerate(self._mounts if additions is not None else ()):
-            for entry, mount in enumerate(mounts):
-                if mount is not None and mount.field in fields:
-                    fields[mount.field][:, mount.place] += additions[:, motor, entry] * mount.scale  # type: ignore[index]
+        for motor, addresses in enumerate(self._addresses if additions is not None else ()):
+            for entry, address in enumerate(addresses):
+                if address is not None and address.field in fields:
+                    fields[address.field][:, address.field_index] += (
+                        additions[:, motor, entry] * address.scale  # type: ignore[index]
+                    )
         return fields
 
 
 def _along(model: mujoco.MjModel) -> dict[int, int]:
-    """Geoms with a length along their body's z axis, each with the entry of its size that is half that length."""
+    """Return geoms along their body's z axis, with the index of their half length."""
     kinds = mujoco.mjtGeom
     entries = {
+        # Indices in `geom_size` of half the length along the geom's z axis.
         int(kinds.mjGEOM_CAPSULE): 1,
         int(kinds.mjGEOM_CYLINDER): 1,
         int(kinds.mjGEOM_BOX): 2,
     }
-    found = {}
+    entries_by_geom = {}
     for geom in range(model.ngeom):
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
         kind = int(model.geom_type[geom])
         if kind in entries and abs(matrix[8]) > 1.0 - 1e-9:
-            found[geom] = entries[kind]
-    return found
+            entries_by_geom[geom] = entries[kind]
+    return entries_by_geom
 
 
 def field_of(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """A field of a model, live, by its name as `Variation.fields` has it."""
+    """Return a live field of a model, by its name in `Variation.fields`."""
     return getattr(model.opt if name.startswith("opt.") else model, name.removeprefix("opt."))
 
 
 def write_fields(model: mujoco.MjModel, fields: Mapping[str, np.ndarray], row: int = 0) -> None:
-    """Write one row of varied fields into a model; what the engine derives from them is not changed."""
+    """Write one row of varied fields into a model; fields derived from them are not updated."""
     for name, values in fields.items():
         setattr(
             model.opt if name.startswith("opt.") else model, name.removeprefix("opt."), values[row]

@@ -1,6 +1,6 @@
-"""Files that trainings leave: whole files, run folders and what they came to, policies that are safe to load.
+"""Run folders: their files, policies and summaries.
 
-Here is what a run folder holds under which name, and what marks it as finished.
+This module defines the names of the files in a run folder and the mark of a finished run.
 """
 
 import re
@@ -12,26 +12,27 @@ PROGRESS, EPISODES, CURVE = "progress.csv", "episodes.csv", "learning_curve.png"
 BEST, CHECKPOINTS, TENSORBOARD, LOCK = "best", "checkpoints", "tensorboard", ".lock"
 POLICY_FILES = WEIGHTS, DESCRIPTION = "policy.safetensors", "policy.json"
 DIGEST = "weights_sha256"
-"""Entry of a policy's description: the digest of its weights."""
+"""Key of the weights' digest in a policy's description."""
 CHECKPOINT = re.compile(r"step-(?P<step>\d{12})-(?P<digest>[0-9a-f]{16})\.safetensors")
-"""Names of checkpoints."""
+"""Pattern of the names of checkpoints."""
 
 
 def finished(run: Path) -> bool:
-    """Whether the training of a run folder is finished: its result, which is written last, is there."""
+    """Return True if the training of a run folder is finished."""
+    # The result is written last.
     return (run / RESULT).is_file()
 
 
-def checkpoints(folder: Path) -> dict[Path, re.Match[str]]:
-    """The checkpoints of a folder, the oldest first, and what their names say."""
+def find_checkpoints(folder: Path) -> dict[Path, re.Match[str]]:
+    """Return the checkpoints of a folder, oldest first, with the match of `CHECKPOINT`."""
     named = {path: CHECKPOINT.fullmatch(path.name) for path in sorted(folder.glob("*"))}
     return {path: match for path, match in named.items() if match is not None}
 
 
-def told_apart(folders: Sequence[Path]) -> list[str]:
-    """Names of some folders, with as much of their paths as tells them apart."""
+def unique_names(folders: Sequence[Path]) -> list[str]:
+    """Return short names of folders, with as many parents as needed to distinguish them."""
     for length in range(1, 4):
-        names = ["/".join(one.resolve().parts[-length:]) for one in folders]
+        names = ["/".join(folder.resolve().parts[-length:]) for folder in folders]
         if len(set(names)) == len(names):
             return names
-    return [f"{name} ({place})" for place, name in enumerate(names, 1)]
+    return [f"{name} ({number})" for number, name in enumerate(names, 1)]

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic writing of files, and reading with digests."""
 
 import contextlib
 import hashlib
@@ -12,17 +12,16 @@ from pathlib import Path
 from typing import Any
 
 _SEAL = "sha256"
-_TEMPORARY = re.compile(
-    r"\.(.+)-[a-z0-9_]{8}(\.[^.]+)?"
-)  # what tempfile makes of the names that `writing` asks for
+# Temporary names that tempfile makes from the prefix and suffix of `atomic_write`.
+_TEMPORARY = re.compile(r"\.(.+)-[a-z0-9_]{8}(\.[^.]+)?")
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that becomes `path` when the block ends, and disappears if it raises.
+def atomic_write(path: Path) -> Iterator[Path]:
+    """Yield a temporary path that replaces `path` after the block, or is deleted if it raises.
 
-    The folder is made if it is missing. The temporary name keeps the suffix, which some encoders go
-    by.
+    A missing folder is created. The temporary name keeps the suffix, because some encoders choose
+    the format by it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
@@ -30,24 +29,26 @@ def writing(path: Path) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        temporary.chmod(0o666 & ~_umask())  # mkstemp's files are private
+        # mkstemp creates private files; a new file normally has the mode 0666 minus the umask.
+        temporary.chmod(0o666 & ~_umask())
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
 
 
-def leftovers(folder: Path) -> list[tuple[Path, str]]:
-    """What `writing` leaves in a folder if its process is killed, and the names that it was to become."""
-    found = ((path, _TEMPORARY.fullmatch(path.name)) for path in folder.glob("*"))
-    return [(path, match[1] + (match[2] or "")) for path, match in found if match is not None]
+def temporary_files(folder: Path) -> list[tuple[Path, str]]:
+    """Return temporary files left by a killed `atomic_write`, with their final names."""
+    matches = ((path, _TEMPORARY.fullmatch(path.name)) for path in folder.glob("*"))
+    return [(path, match[1] + (match[2] or "")) for path, match in matches if match is not None]
 
 
 @contextlib.contextmanager
-def writing_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder beside `path` that becomes `path` when the block ends, and disappears if it raises.
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder that becomes `path` after the block, or is deleted if it raises.
 
-    It raises where `path` exists and is not an empty folder.
+    Raises:
+        OSError: `path` exists and is not an empty folder.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
@@ -61,30 +62,31 @@ def writing_folder(path: Path) -> Iterator[Path]:
 
 
 def _umask() -> int:
+    # The umask can only be read by setting it.
     mask = os.umask(0)
     os.umask(mask)
     return mask
 
 
 def check_writable(folder: Path) -> None:
-    """Find out before hours of work whether `folder` can hold results; makes nothing."""
-    present = folder.absolute()
-    while not present.exists():
-        present = present.parent
-    if not present.is_dir():
-        raise NotADirectoryError(f"cannot write to {folder}: {present} is not a folder")
+    """Raise if `folder` cannot be written to, before hours of work; nothing is created."""
+    existing = folder.absolute()
+    while not existing.exists():
+        existing = existing.parent
+    if not existing.is_dir():
+        raise NotADirectoryError(f"cannot write to {folder}: {existing} is not a folder")
     try:
-        tempfile.TemporaryFile(
-            dir=present
-        ).close()  # has no name; not even root may write everywhere
+        # Permission bits do not suffice (root, read-only file systems), so a nameless file is
+        # written.
+        tempfile.TemporaryFile(dir=existing).close()
     except OSError as error:
         raise PermissionError(
-            f"cannot write to {folder}: no permission to write in {present} ({error.strerror})"
+            f"cannot write to {folder}: no permission to write in {existing} ({error.strerror})"
         ) from None
 
 
 def check_file(path: Path) -> None:
-    """Find out before hours of work whether the file `path` can be written; makes nothing."""
+    """Raise if the file `path` cannot be written, before hours of work; nothing is created."""
     if path.is_dir():
         raise IsADirectoryError(
             f"cannot write {path}: it is a folder: name a file, such as {path}/NAME"
@@ -93,7 +95,7 @@ def check_file(path: Path) -> None:
 
 
 def check_page(path: Path) -> None:
-    """Refuse a page's file by its suffix, or where it cannot be written."""
+    """Raise if an HTML page has the wrong suffix or cannot be written."""
     if path.suffix not in (".html", ".htm"):
         raise ValueError(
             f"page {path}: the suffix is {path.suffix!r}, must be .html; write {path.stem}.html"
@@ -102,31 +104,40 @@ def check_page(path: Path) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write `content` as indented JSON, whole or not at all."""
-    with writing(path) as temporary:
+    """Write `content` atomically as indented JSON."""
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n")
 
 
-def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The content and, as its entry `sha256`, a digest of all the rest, which `read_json` checks and takes off."""
-    plain = json.loads(
-        json.dumps(content)
-    )  # what a reader will see: names that are text, lists for tuples
-    return {_SEAL: hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest(), **plain}
+def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content with its digest as the entry `sha256`, which `read_json` checks."""
+    # The digest is of the content as JSON returns it: keys are strings, and tuples are lists.
+    json_content = json.loads(json.dumps(content))
+    return {
+        _SEAL: hashlib.sha256(json.dumps(json_content, sort_keys=True).encode()).hexdigest(),
+        **json_content,
+    }
 
 
-def check_digest(path: Path, content: bytes, expected: Any, beside: str) -> None:
-    """Refuse a file's content that has not the SHA-256 which the file `beside` it names; none where that is None."""
+def check_digest(path: Path, content: bytes, expected: Any, description: str) -> None:
+    """Raise if a file's content does not have the expected SHA-256; None accepts any content.
+
+    Args:
+        path: the file.
+        content: its content.
+        expected: digest from the description.
+        description: name of the file with the digest.
+    """
     if expected is not None and hashlib.sha256(content).hexdigest() != expected:
         raise ValueError(
-            f"{path} is truncated or damaged, or it and {beside} do not belong together: its sha256"
-            " is not the one there. Copy both files anew from where they came; a training that was"
-            " killed mends its own when it is resumed"
+            f"{path} is truncated or damaged, or it and {description} do not belong together: its"
+            " sha256 differs from the recorded one. Copy both files again from their source; a"
+            " killed training repairs its files when it is resumed"
         )
 
 
-def below(prefix: str, content: Mapping[str, Any]) -> dict[str, Any]:
-    """What the names with that prefix name, by the rest of them: a file's arrays stand side by side."""
+def select_prefix(prefix: str, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries whose names have a prefix, without the prefix."""
     return {
         name.removeprefix(prefix): value
         for name, value in content.items()
@@ -134,24 +145,30 @@ def below(prefix: str, content: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def read_json(path: Path, what: str) -> Any:
-    """Read JSON; of what is `sealed`, the content alone. `what` the file is goes into the error.
+def read_json(path: Path, kind: str) -> Any:
+    """Read JSON; check and remove the digest of `with_digest`, if any.
 
-    A missing file is a FileNotFoundError, a truncated or edited one a ValueError.
+    Args:
+        path: the file.
+        kind: description of the file for error messages.
+
+    Raises:
+        FileNotFoundError: the file is missing.
+        ValueError: the file is truncated or was edited.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"no {what} at {path}")
+        raise FileNotFoundError(f"no {kind} at {path}")
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not a {what}: it is truncated or not JSON ({error})") from None
+        raise ValueError(f"{path} is not a {kind}: it is truncated or not JSON ({error})") from None
     if not isinstance(content, dict) or _SEAL not in content:
         return content
-    plain = {name: value for name, value in content.items() if name != _SEAL}
-    if content[_SEAL] != sealed(plain)[_SEAL]:
+    json_content = {name: value for name, value in content.items() if name != _SEAL}
+    if content[_SEAL] != with_digest(json_content)[_SEAL]:
         raise ValueError(
-            f"{path} is not the {what} that was written: its content does not have the {_SEAL} that"
-            " it names. It was damaged or edited: copy it anew from where it came, or delete its"
+            f"{path} is not the {kind} that was written: its content does not have the {_SEAL} that"
+            " it names. It was damaged or edited: copy it again from its source, or delete its"
             f" entry {_SEAL} if you meant to edit it"
         )
-    return plain
+    return json_content

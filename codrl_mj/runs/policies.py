@@ -1,7 +1,7 @@
-"""Trained policies as files that are safe to load: safetensors for the weights, JSON for everything else.
+"""Policies as files that are safe to load: safetensors for the weights, JSON for everything else.
 
-`load_policy` never unpickles, so a policy from elsewhere can do no more than choose bad actions.
-`load_sb3_zip` does, and says so.
+`load_policy` never unpickles, so a policy from an unknown source can only choose bad actions.
+`load_sb3_zip` unpickles, and requires `trust`.
 """
 
 import contextlib
@@ -18,19 +18,19 @@ from codrl_mj.actuators import allow_imports
 from codrl_mj.agents import AgentConfig, agent_from_mapping
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs import DESCRIPTION, DIGEST, WEIGHTS
-from codrl_mj.runs.files import check_digest, read_json, sealed, write_json, writing
+from codrl_mj.runs.files import atomic_write, check_digest, read_json, with_digest, write_json
 
 FORMAT = "codrl_mj policy 2"
 _ENTRIES = {"format", DIGEST, "agent", "observation_space", "action_space"}
 
 
 class Policy(Protocol):
-    """Anything that chooses actions; Stable-Baselines3's policies and models are such."""
+    """Protocol of a policy; Stable-Baselines3's policies and models follow it."""
 
     def predict(
         self, observation: np.ndarray, *, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
-        """(observations (N, k)) -> actions (N, ...), and a state that is not used."""
+        """Return actions (N, ...) for observations (N, k), and a state that is not used."""
 
 
 def _describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
@@ -46,17 +46,23 @@ def _describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
     raise ValueError(f"a policy over {space} cannot be saved: only Box and Discrete spaces can")
 
 
-def _make_space(described: dict[str, Any]) -> spaces.Space[Any]:
-    if described["type"] == "Discrete":
-        return spaces.Discrete(described["n"])
-    dtype = np.dtype(described["dtype"]).type
+def _make_space(description: dict[str, Any]) -> spaces.Space[Any]:
+    if description["type"] == "Discrete":
+        return spaces.Discrete(description["n"])
+    dtype = np.dtype(description["dtype"]).type
     return spaces.Box(
-        np.array(described["low"], dtype), np.array(described["high"], dtype), dtype=dtype
+        np.array(description["low"], dtype), np.array(description["high"], dtype), dtype=dtype
     )
 
 
 def save_policy(policy: Any, agent: AgentConfig, folder: Path) -> None:
-    """Write the policy of a model that `agent` made: `policy.safetensors` and `policy.json`, with digests of both."""
+    """Write a policy as `policy.safetensors` and `policy.json`, with digests of both.
+
+    Args:
+        policy: policy of a model that `agent` made.
+        agent: settings of the agent.
+        folder: folder of the files.
+    """
     from safetensors.torch import save
 
     weights = save({name: tensor.contiguous() for name, tensor in policy.state_dict().items()})
@@ -67,17 +73,17 @@ def save_policy(policy: Any, agent: AgentConfig, folder: Path) -> None:
         "observation_space": _describe_space(policy.observation_space),
         "action_space": _describe_space(policy.action_space),
     }
-    with writing(folder / WEIGHTS) as temporary:
+    with atomic_write(folder / WEIGHTS) as temporary:
         temporary.write_bytes(weights)
-    write_json(folder / DESCRIPTION, sealed(description))
+    write_json(folder / DESCRIPTION, with_digest(description))
 
 
 def load_policy(folder: Path, trust: bool = False) -> Any:
-    """Load a policy that `save_policy` wrote; nothing in the files is executed.
+    """Load a policy written by `save_policy`, without executing anything in the files.
 
     Args:
         folder: a run folder, or any folder with `policy.safetensors` and `policy.json`.
-        trust: whether to import the module of an agent that is none of ours, which executes it.
+        trust: whether to import the module of a custom agent, which executes it.
 
     Returns:
         The policy (`predict(observations, deterministic=...)`).
@@ -85,7 +91,7 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
     Raises:
         FileNotFoundError: the folder has no policy.
         ValueError: the files are truncated, damaged, of another format, or do not belong together.
-            Policies from before there were digests are loaded without that proof.
+            Policies from versions without digests are loaded without that check.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load
@@ -95,10 +101,11 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
         raise ValueError(
             f"{folder / DESCRIPTION}: not a policy of this program: its format must be {FORMAT!r}"
         )
-    if surplus := description.keys() - _ENTRIES:  # such as the digest's name, damaged
+    # A damaged key, such as that of the digest, would otherwise pass as a missing digest.
+    if unknown_entries := description.keys() - _ENTRIES:
         raise ValueError(
-            f"{folder / DESCRIPTION} has unknown entries: {', '.join(sorted(surplus))}. Copy it"
-            " anew"
+            f"{folder / DESCRIPTION} has unknown entries:"
+            f" {', '.join(sorted(unknown_entries))}. Copy it again"
         )
     weights = folder / WEIGHTS
     if not weights.is_file():
@@ -137,10 +144,10 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
 
 
 class NormalizedPolicy:
-    """A policy behind the observation statistics of Stable-Baselines3's `VecNormalize`."""
+    """Policy with the observation statistics of Stable-Baselines3's `VecNormalize`."""
 
     def __init__(self, policy: Any, statistics: Any) -> None:
-        """Combine a policy with the `VecNormalize` through which it was trained."""
+        """Combine a policy with the `VecNormalize` of its training."""
         self.policy, self.statistics = policy, statistics
         self.observation_space, self.action_space = policy.observation_space, policy.action_space
 
@@ -154,19 +161,26 @@ class NormalizedPolicy:
 
 
 def load_sb3_zip(path: Path, agent: str, trust: bool, normalize: Path | str | None = None) -> Any:
-    """Load the policy of a model that Stable-Baselines3 saved, by an algorithm, such as `ppo`, that it does not name.
+    """Load the policy of a model that Stable-Baselines3 saved as a zip.
 
-    Neither file is opened without `trust` that whoever made it may execute code on this machine,
-    which loading allows. `normalize` is the file that `VecNormalize.save` wrote, if the model was
-    trained behind it, else `"none"`. None refuses a zip that seems to have been.
+    Args:
+        path: the zip.
+        agent: algorithm of the model, such as `ppo`; the zip does not name it.
+        trust: required to load the files, because unpickling executes code from their author.
+        normalize: file written by `VecNormalize.save` if the model was trained with it, or "none".
+            None raises if the model seems to need one.
+
+    Raises:
+        FileNotFoundError: a file does not exist.
+        ValueError: `trust` is False, the agent is unknown, or a file is not what it should be.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no model at {path}")
     if not trust:
         raise ValueError(
             f"{path} is a Stable-Baselines3 model: it holds pickled Python objects, and loading it"
-            " executes whatever its author put there. Pass --trust if that author is you, or"
-            " somebody whose programs you would run"
+            " executes whatever its author put there. Pass --trust if you are the author,"
+            " or if you would run the author's programs"
         )
     import stable_baselines3
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -178,11 +192,12 @@ def load_sb3_zip(path: Path, agent: str, trust: bool, normalize: Path | str | No
         )
     try:
         model = kind.load(path, device="cpu")  # type: ignore[attr-defined]
-    except Exception as error:  # whatever the file's objects raise
+    # Unpickled objects can raise any exception.
+    except Exception as error:
         raise ValueError(f"{path} is not a model of {agent}: {error!r}") from None
     model.policy.set_training_mode(False)
     if normalize is None:
-        _check_whole(path, model)
+        _check_normalization(path, model)
     if normalize in (None, "none"):
         return model.policy
     return NormalizedPolicy(
@@ -191,7 +206,7 @@ def load_sb3_zip(path: Path, agent: str, trust: bool, normalize: Path | str | No
 
 
 def _load_statistics(path: Path, space: spaces.Space[Any]) -> Any:
-    """Unpickle a `VecNormalize` for observations of a space; only for a caller that trusts the file."""
+    """Unpickle a `VecNormalize` for observations of a space; only for trusted files."""
     from stable_baselines3.common.vec_env import VecNormalize
 
     try:
@@ -200,7 +215,8 @@ def _load_statistics(path: Path, space: spaces.Space[Any]) -> Any:
         raise FileNotFoundError(
             f"--normalize {path}: no such file; name what VecNormalize.save wrote, or none"
         ) from None
-    except Exception as error:  # whatever the file's objects raise
+    # Unpickled objects can raise any exception.
+    except Exception as error:
         raise ValueError(
             f"--normalize {path}: must be a file that VecNormalize.save wrote: {error!r}"
         ) from None
@@ -222,12 +238,15 @@ def _load_statistics(path: Path, space: spaces.Space[Any]) -> Any:
     return statistics
 
 
-def _check_whole(path: Path, model: Any) -> None:
-    """Refuse a model that seems to have been trained behind `VecNormalize`, and warn where nothing can be told."""
+def _check_normalization(path: Path, model: Any) -> None:
+    """Raise if a model was probably trained with `VecNormalize`; warn if that is unknown."""
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-    beside, reason = [*path.parent.glob("*.pkl"), *path.parent.glob("*/vecnormalize.pkl")], ""
-    seen, space, is_on_policy = (
+    statistics_files, reason = (
+        [*path.parent.glob("*.pkl"), *path.parent.glob("*/vecnormalize.pkl")],
+        "",
+    )
+    last_observations, space, is_on_policy = (
         model._last_obs,
         model.observation_space,
         isinstance(model, OnPolicyAlgorithm),
@@ -237,19 +256,19 @@ def _check_whole(path: Path, model: Any) -> None:
     if is_on_policy and model._last_original_obs is not None:
         reason = "its last observations were normalized"
     elif (
-        isinstance(seen, np.ndarray)
-        and ((seen < space.low - 1e-4) | (seen > space.high + 1e-4)).any()
+        isinstance(last_observations, np.ndarray)
+        and ((last_observations < space.low - 1e-4) | (last_observations > space.high + 1e-4)).any()
     ):
         reason = "its last observations lie outside of its observation space, as normalized ones do"
-    elif beside:
-        reason = f"{', '.join(map(str, sorted(beside)[:3]))} may have its statistics"
+    elif statistics_files:
+        reason = f"{', '.join(map(str, sorted(statistics_files)[:3]))} may have its statistics"
     remedy = "name what VecNormalize.save wrote with --normalize FILE.pkl, or say --normalize none"
     if reason:
         raise ValueError(
             f"{path} may be half of a policy that was trained behind VecNormalize: {reason}:"
             f" {remedy}"
         )
-    if model.num_timesteps and not (is_on_policy and seen is not None):
+    if model.num_timesteps and not (is_on_policy and last_observations is not None):
         warnings.warn(
             f"{path} does not say whether it was trained behind VecNormalize: if so, {remedy}",
             stacklevel=3,
@@ -257,15 +276,17 @@ def _check_whole(path: Path, model: Any) -> None:
 
 
 def check_spaces(policy: Any, env: EnvConfig, exact: bool = True) -> None:
-    """Refuse an environment with other observations or actions than those of a policy's training, if it tells them.
+    """Raise if an environment has other spaces than those of a policy's training, if known.
 
-    Unless `exact`, actions that differ in their bounds alone are warned of.
+    Without `exact`, a difference only in the bounds of the actions is a warning.
     """
     if all(getattr(policy, name, None) is None for name in ("observation_space", "action_space")):
         return
-    with contextlib.closing(env.make()) as made:
-        present = {name: getattr(made, name) for name in ("observation_space", "action_space")}
-    for name, space in present.items():
+    with contextlib.closing(env.make()) as opened_env:
+        env_spaces = {
+            name: getattr(opened_env, name) for name in ("observation_space", "action_space")
+        }
+    for name, space in env_spaces.items():
         if (trained := getattr(policy, name, None)) is None or _is_same(trained, space):
             continue
         text = f"{name}: the policy was trained with {trained}, {env.task} as it is set has {space}"
@@ -284,9 +305,9 @@ def check_spaces(policy: Any, env: EnvConfig, exact: bool = True) -> None:
         warnings.warn(text, stacklevel=2)
 
 
-def _is_same(one: Any, other: Any, bounds: bool = True) -> bool:
-    """Return whether two spaces have the same elements, but for rounding to float32."""
-    if not (isinstance(one, spaces.Box) and isinstance(other, spaces.Box)):
-        return bool(one == other)
-    ends = ((one.low, other.low), (one.high, other.high)) if bounds else ()
-    return one.shape == other.shape and all(np.allclose(*pair, rtol=1e-5) for pair in ends)
+def _is_same(space: Any, other_space: Any, bounds: bool = True) -> bool:
+    """Return True if two spaces have the same elements, up to rounding to float32."""
+    if not (isinstance(space, spaces.Box) and isinstance(other_space, spaces.Box)):
+        return bool(space == other_space)
+    ends = ((space.low, other_space.low), (space.high, other_space.high)) if bounds else ()
+    return space.shape == other_space.shape and all(np.allclose(*pair, rtol=1e-5) for pair in ends)

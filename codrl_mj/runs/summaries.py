@@ -1,4 +1,4 @@
-"""Run folders: finding them, what they came to, and what differs between them. A damaged one is listed as such."""
+"""Summaries and comparisons of run folders; damaged folders are listed as damaged."""
 
 import contextlib
 import csv
@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from codrl_mj.actuators import actuator_from_mapping, allow_imports, name_of
+from codrl_mj.actuators import actuator_from_mapping, allow_imports, display_name
 from codrl_mj.envs.sources import pattern_mapping
-from codrl_mj.fields import leaves
+from codrl_mj.fields import flatten
 from codrl_mj.runs import (
     BEST,
     CONFIG,
@@ -32,38 +32,38 @@ from codrl_mj.tasks import TASKS
 
 @dataclasses.dataclass(frozen=True)
 class RunSummary:
-    """One run folder. What its files do not say is None."""
+    """Summary of a run folder; values missing from its files are None."""
 
     path: Path
     """The folder."""
     name: str
-    """The folder relative to the one that was searched."""
+    """Path relative to the searched folder."""
     state: Literal["finished", "unfinished", "damaged"]
-    """Whether the training was finished. Damaged: a file cannot be read, or is missing."""
+    """State of the training; `damaged` if a file is missing or cannot be read."""
     problem: str | None = None
-    """What is damaged."""
+    """Description of the damage."""
     task: str | None = None
     """Task name."""
     agent: str | None = None
     """Name of the agent, such as `ppo`."""
     actuator: str | None = None
-    """Name of the actuator trained through; `custom` if it is none of the task's named ones."""
+    """Name of the actuator in training; `custom` if it is not a named one of the task."""
     seed: int | None = None
     """Training seed."""
     steps: int | None = None
-    """Environment steps done."""
+    """Completed environment steps."""
     total_steps: int | None = None
-    """Environment steps to do."""
+    """Planned environment steps."""
     mean_return: float | None = None
-    """Mean return of the last training episodes, as training reported it last."""
+    """Mean return of the last training episodes, from the last report."""
     seconds: float | None = None
     """Wall-clock time of the training [s]."""
     modified: float | None = None
-    """When one of its files was written last [s since 1970]."""
+    """Time of the last change of a file [s since 1970]."""
     evaluation: Mapping[str, Any] | None = None
     """`Evaluation.as_mapping()` of the last policy."""
     configuration: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """What it was made with: fields of the training's configuration and of the software, by dotted names."""
+    """Fields of the training configuration and software versions, by dotted name."""
 
     @property
     def evaluation_return(self) -> float | None:
@@ -72,7 +72,7 @@ class RunSummary:
         return _number(returns.get("mean")) if isinstance(returns, Mapping) else None
 
     def as_mapping(self) -> dict[str, Any]:
-        """The summary as JSON-serialisable values; `modified` in ISO 8601, UTC."""
+        """Return the summary as JSON-serializable values; `modified` in ISO 8601, UTC."""
         modified = None
         if self.modified is not None:
             modified = datetime.datetime.fromtimestamp(self.modified, datetime.UTC).isoformat(
@@ -83,56 +83,54 @@ class RunSummary:
 
 
 def find_runs(root: Path) -> list[RunSummary]:
-    """Every run folder at or below a folder, by name. Hidden folders and folders within runs are passed over."""
+    """Return every run folder at or below a folder by name; hidden folders are skipped."""
     if not root.is_dir():
         raise FileNotFoundError(f"no folder {root} to look for runs in")
-    found = []
-    for folder, below, files in os.walk(root):
+    runs = []
+    for folder, subfolders, files in os.walk(root):
         if CONFIG in files:
-            below.clear()
+            subfolders.clear()
             path = Path(folder)
-            found.append(
-                read_run(path, path.relative_to(root).as_posix() if path != root else None)
-            )
-        below[:] = [name for name in below if not name.startswith(".")]
-    return sorted(found, key=lambda run: run.name)
+            runs.append(read_run(path, path.relative_to(root).as_posix() if path != root else None))
+        subfolders[:] = [name for name in subfolders if not name.startswith(".")]
+    return sorted(runs, key=lambda run: run.name)
 
 
-def typical_seed(evaluation: Mapping[str, Any] | None) -> int | None:
-    """Return the seed of the evaluated episode with the median return (of two, the lower); None if none is known."""
+def median_seed(evaluation: Mapping[str, Any] | None) -> int | None:
+    """Return the seed of the evaluated episode with the (lower) median return; None if unknown."""
     returns, conditions = (
         (evaluation or {}).get(name) for name in ("episode_returns", "conditions")
     )
     seed = conditions.get("seed") if isinstance(conditions, Mapping) else None
     if not isinstance(returns, list) or not returns or not isinstance(seed, int):
         return None
-    if not all(isinstance(one, int | float) for one in returns):
+    if not all(isinstance(value, int | float) for value in returns):
         return None
     return seed + sorted(range(len(returns)), key=returns.__getitem__)[(len(returns) - 1) // 2]
 
 
-def rank(evaluation: Mapping[str, Any] | None, total: float) -> str:
-    """Return in words how an episode's return compares with those of an evaluation; nothing where there is none."""
-    if (seed := typical_seed(evaluation)) is None or evaluation is None:
+def describe_rank(evaluation: Mapping[str, Any] | None, total: float) -> str:
+    """Return a text comparing an episode's return with an evaluation; empty without evaluation."""
+    if (seed := median_seed(evaluation)) is None or evaluation is None:
         return ""
     returns = evaluation["episode_returns"]
-    median, worse = (
+    median, num_lower = (
         returns[seed - evaluation["conditions"]["seed"]],
-        sum(one < total for one in returns),
+        sum(value < total for value in returns),
     )
     return (
-        f"of {len(returns)} evaluated episodes {worse} returned less, the median {median:.3g} (seed"
-        f" {seed})"
+        f"of {len(returns)} evaluated episodes {num_lower} returned less, the median {median:.3g}"
+        f" (seed {seed})"
     )
 
 
 def read_evaluation(run: Path, best: bool) -> Mapping[str, Any] | None:
-    """Return the evaluation of a run's last policy, or of its best; None if there is none that can be read."""
+    """Return the evaluation of a run's last or best policy; None if missing or unreadable."""
     return _mapping((run / BEST if best else run) / EVALUATION, "policy evaluation", [])
 
 
 def read_run(path: Path, name: str | None = None) -> RunSummary:
-    """What a run folder says; it is called by its own name unless another is given."""
+    """Summarize a run folder; the default name is that of the folder."""
     if not (path / CONFIG).is_file():
         raise FileNotFoundError(f"no run at {path}: there is no {CONFIG}")
     problems: list[str] = []
@@ -147,37 +145,37 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
     result = _mapping(path / RESULT, "result of a run", problems)
     evaluation = _mapping(path / EVALUATION, "policy evaluation", problems)
     missing = [file for file in POLICY_FILES if not (path / file).is_file()]
-    done = finished(path)
-    if done and missing:
+    is_finished = finished(path)
+    if is_finished and missing:
         problems.append(
-            f"it is finished, but {' and '.join(missing)} is missing: copy the folder anew"
+            f"it is finished, but {' and '.join(missing)} is missing: copy the folder again"
         )
     for folder in (path, path / BEST):
-        described = _mapping(folder / DESCRIPTION, "policy description", problems)
+        description = _mapping(folder / DESCRIPTION, "policy description", problems)
         try:
-            if described is not None and (folder / WEIGHTS).is_file():
+            if description is not None and (folder / WEIGHTS).is_file():
                 check_digest(
                     folder / WEIGHTS,
                     (folder / WEIGHTS).read_bytes(),
-                    described.get(DIGEST),
+                    description.get(DIGEST),
                     DESCRIPTION,
                 )
         except (ValueError, OSError) as error:
             problems.append(str(error))
-    reported, learned = _first("steps", progress), _first("steps", result)
-    if None not in (reported, learned) and reported != learned:
+    reported, trained_steps = _first("steps", progress), _first("steps", result)
+    if None not in (reported, trained_steps) and reported != trained_steps:
         problems.append(
-            f"{path / PROGRESS} ends at step {reported:.0f} of {learned:.0f}: copy it anew"
+            f"{path / PROGRESS} ends at step {reported:.0f} of {trained_steps:.0f}: copy it again"
         )
     agent = config.get("agent")
     task = env["task"] if isinstance(env.get("task"), str) else None
-    steps, pace = _first("steps", result, progress), _first("steps_per_second", progress)
-    uninterrupted = steps / pace if steps is not None and pace else None
+    steps, rate = _first("steps", result, progress), _first("steps_per_second", progress)
+    uninterrupted = steps / rate if steps is not None and rate else None
     seconds = _first("seconds", result, progress)
     return RunSummary(
         path=path,
         name=path.resolve().name if name is None else name,
-        state="damaged" if problems else "finished" if done else "unfinished",
+        state="damaged" if problems else "finished" if is_finished else "unfinished",
         problem="; ".join(problems) or None,
         task=task,
         agent=str(agent["name"]) if isinstance(agent, Mapping) and "name" in agent else None,
@@ -189,12 +187,12 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
         seconds=uninterrupted if seconds is None else seconds,
         modified=_modified(path),
         evaluation=evaluation,
-        configuration=leaves(
+        configuration=flatten(
             {
                 **config,
                 **{
-                    key: one
-                    for key, one in (content or {}).items()
+                    key: value
+                    for key, value in (content or {}).items()
                     if key not in ("train", "labels")
                 },
             }
@@ -202,25 +200,26 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
     )
 
 
-def _mapping(path: Path, what: str, problems: list[str]) -> Mapping[str, Any] | None:
-    """A JSON file's mapping; None if there is no such file, or if it is damaged, which is then noted."""
+def _mapping(path: Path, kind: str, problems: list[str]) -> Mapping[str, Any] | None:
+    """Return the mapping in a JSON file; None if it is missing or damaged (added to `problems`)."""
     try:
-        content = read_json(path, what)
+        content = read_json(path, kind)
     except FileNotFoundError:
         return None
     except (ValueError, OSError, RecursionError) as error:
         problems.append(str(error))
         return None
     if not isinstance(content, Mapping):
-        problems.append(f"{path} is not a {what}: it is no JSON object")
+        problems.append(f"{path} is not a {kind}: it is no JSON object")
         return None
     return content
 
 
 def read_reports(path: Path, problems: list[str]) -> list[Mapping[str, str]]:
-    """The whole rows of a training's progress, as text: the last may be half written.
+    """Return the complete rows of a training's progress file, as text.
 
-    `problems` gets what is wrong with the table, of which there are then no rows.
+    A last row that is only partly written is skipped. If the table cannot be read, the error is
+    added to `problems`.
     """
     try:
         with path.open(newline="") as file:
@@ -236,7 +235,7 @@ def read_reports(path: Path, problems: list[str]) -> list[Mapping[str, str]]:
 
 
 def _number(value: Any) -> float | None:
-    """A finite number, or None."""
+    """Return a finite number, or None."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -245,15 +244,16 @@ def _number(value: Any) -> float | None:
 
 
 def _whole(value: Any) -> int | None:
-    """A whole number, or None."""
+    """Return an integer, or None."""
     number = _number(value)
     return None if number is None else int(number)
 
 
 def _modified(folder: Path) -> float | None:
-    """When a file of a folder was written last [s since 1970]; files may vanish meanwhile."""
+    """Return the time of the last change of a file in a folder [s since 1970]."""
     times = []
     for file in folder.iterdir():
+        # Another process may delete files meanwhile, such as temporary ones.
         with contextlib.suppress(FileNotFoundError):
             if file.is_file():
                 times.append(file.stat().st_mtime)
@@ -261,37 +261,34 @@ def _modified(folder: Path) -> float | None:
 
 
 def _first(name: str, *sources: Mapping[str, Any] | None) -> float | None:
-    """The first of some sources' numbers of that name; None if none has one."""
+    """Return the first finite number of a name among sources; None if there is none."""
     numbers = (_number((source or {}).get(name)) for source in sources)
     return next((number for number in numbers if number is not None), None)
 
 
 def _actuator_of(env: Mapping[str, Any], task: str | None, labels: Any) -> str | None:
-    """What to call an environment's actuators: those of motors, in environments of others those of patterns."""
+    """Return the names of an environment's actuators, by motor or by pattern of motors."""
     if "actuator" not in env:
         return None
-    each, patterns = env["actuator"], pattern_mapping(env["actuator"])
+    actuators, patterns = env["actuator"], pattern_mapping(env["actuator"])
     if patterns is not None:
-        each = list(patterns.values())
-    elif not isinstance(each, list):
-        each = [each]
+        actuators = list(patterns.values())
+    elif not isinstance(actuators, list):
+        actuators = [actuators]
     labels = labels if isinstance(labels, list) else []
     papers = TASKS[task].paper if task in TASKS else ()
     names: list[str] = []
     for actuator, label, paper in itertools.zip_longest(
-        each, labels[: len(each)], papers[: len(each)]
+        actuators, labels[: len(actuators)], papers[: len(actuators)]
     ):
         if label or actuator is None or isinstance(actuator, str):
             names.append(str(label or actuator or "ideal"))
             continue
         try:
             with allow_imports(False):
-                names.append(name_of(actuator_from_mapping(actuator), paper))
-        except (
-            ValueError,
-            TypeError,
-            AttributeError,
-        ):  # somebody's family is called so, what cannot be read is not
+                names.append(display_name(actuator_from_mapping(actuator), paper))
+        # A custom family keeps its family name; an unreadable description is "custom".
+        except (ValueError, TypeError, AttributeError):
             names.append(
                 str(actuator.get("family", "custom")) if isinstance(actuator, Mapping) else "custom"
             )
@@ -299,14 +296,14 @@ def _actuator_of(env: Mapping[str, Any], task: str | None, labels: Any) -> str |
 
 
 SORT_KEYS = ("name", "task", "agent", "actuator", "state", "steps", "return", "seconds", "modified")
-"""What runs can be sorted by."""
+"""Keys for sorting runs."""
 _HIGHEST_FIRST = ("steps", "return", "seconds", "modified")
 
 
 def sort_runs(runs: Sequence[RunSummary], key: str) -> list[RunSummary]:
-    """The runs in another order: names from A, numbers and times from the highest. Runs without a value come last.
+    """Sort runs: names from A to Z, numbers and times descending, runs without a value last.
 
-    `return`, of `SORT_KEYS`, is the evaluation's, or the training's where there was none.
+    The key `return` is the mean return of the evaluation, or of the training without evaluation.
     """
     if key not in SORT_KEYS:
         raise ValueError(f"sort = {key!r}: must be one of {', '.join(SORT_KEYS)}")
@@ -324,43 +321,47 @@ def sort_runs(runs: Sequence[RunSummary], key: str) -> list[RunSummary]:
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """Runs side by side. Every row has a value for each run, None where it has none."""
+    """Comparison of runs; every row has a value for each run, or None."""
 
     names: tuple[str, ...]
     """Names of the runs."""
     configuration: Mapping[str, tuple[Any, ...]]
-    """Dotted name of a setting that differs -> its values."""
+    """Dotted name of a differing setting -> values."""
     results: Mapping[str, tuple[Any, ...]]
-    """Name of a result -> its values; measures of the evaluation are numbers, or mappings of a mean and an interval."""
+    """Name of a result -> values; a measure is a number, or a mapping with mean and interval."""
     units: Mapping[str, str]
-    """Name of a result -> its unit."""
+    """Name of a result -> unit."""
 
 
 def compare(runs: Sequence[RunSummary]) -> Comparison:
-    """What differs in the configuration of two or more runs, and their results."""
+    """Return the differing settings and the results of two or more runs."""
     if len(runs) < 2:
         raise ValueError(f"runs: {len(runs)}: there must be two or more to compare")
     named = [{**run.configuration, "env.actuator": run.actuator} for run in runs]
-    if any(run.actuator == "ideal" for run in runs):  # which has no fields that could differ
+    # The ideal actuator has no fields to compare, so only the actuators' names are.
+    if any(run.actuator == "ideal" for run in runs):
         named = [
-            {key: value for key, value in one.items() if not key.startswith("env.actuator.")}
-            for one in named
+            {key: value for key, value in entry.items() if not key.startswith("env.actuator.")}
+            for entry in named
         ]
     settings = {
-        key: tuple(one.get(key) for one in named)
-        for key in dict.fromkeys(key for one in named for key in one)
+        key: tuple(entry.get(key) for entry in named)
+        for key in dict.fromkeys(key for entry in named for key in entry)
     }
     results: dict[str, tuple[Any, ...]] = {
         name: tuple(getattr(run, name) for run in runs)
         for name in ("state", "problem", "steps", "mean_return", "seconds")
     }
     evaluations = [run.evaluation or {} for run in runs]
-    units = [one.get("units") for one in evaluations]
+    units = [entry.get("units") for entry in evaluations]
     measures = {
-        name: str(unit) for one in units if isinstance(one, Mapping) for name, unit in one.items()
+        name: str(unit)
+        for entry in units
+        if isinstance(entry, Mapping)
+        for name, unit in entry.items()
     }
     for measure in measures:
-        results[f"evaluation.{measure}"] = tuple(one.get(measure) for one in evaluations)
+        results[f"evaluation.{measure}"] = tuple(entry.get(measure) for entry in evaluations)
     results = {
         name: values
         for name, values in results.items()

@@ -1,18 +1,25 @@
-"""Drives on paper: what they can do, their current loops, and which does a task; docs/motors.md."""
+"""Sizing of drives: limits, current loops, demands and choice; docs/motors.md."""
 
 from codrl_mj.sizing.abilities import (
     Abilities,
     abilities,
     catalogue_rows,
+    describe_unknown,
     explain,
     find_drive,
     find_entry,
     find_loop,
     torque_limits,
-    unknown_in_words,
 )
-from codrl_mj.sizing.choice import Candidate, actuators_of, choose, equal_gears, geared, uncounted
-from codrl_mj.sizing.demand import Demand, demand_of, demands_of, recorded
+from codrl_mj.sizing.choice import (
+    Candidate,
+    actuators_of,
+    choose,
+    equivalent_gears,
+    ignored_quantities,
+    with_best_gear,
+)
+from codrl_mj.sizing.demand import Demand, demand_from_arrays, demand_of, demands_of
 from codrl_mj.sizing.feasibility import (
     DEPENDS,
     HOPELESS,
@@ -27,22 +34,22 @@ from codrl_mj.sizing.feasibility import (
     operation,
 )
 from codrl_mj.sizing.loop import (
+    CurrentLoopActuator,
     LoopDesign,
-    Looped,
     Response,
-    Steps,
+    StepResponses,
     closed_loop,
     design,
     designs,
     gains,
     is_closed,
     open_loop,
-    respond,
-    sampled_too_seldom,
-    small_step,
-    step,
+    simulate_loop,
+    small_step_response,
+    step_responses,
+    undersampling_warning,
 )
-from codrl_mj.sizing.swing import Swing, least_gain, least_pumped, least_voltage
+from codrl_mj.sizing.swing import Swing, min_energy_gain, min_pumped_energy, min_supply_voltage
 
 __all__ = [
     "find_drive",
@@ -53,25 +60,25 @@ __all__ = [
     "torque_limits",
     "catalogue_rows",
     "explain",
-    "unknown_in_words",
-    "Looped",
+    "describe_unknown",
+    "CurrentLoopActuator",
     "is_closed",
     "gains",
     "LoopDesign",
     "design",
     "designs",
-    "sampled_too_seldom",
+    "undersampling_warning",
     "open_loop",
     "closed_loop",
     "Response",
-    "respond",
-    "small_step",
-    "Steps",
-    "step",
+    "simulate_loop",
+    "small_step_response",
+    "StepResponses",
+    "step_responses",
     "Demand",
     "demand_of",
     "demands_of",
-    "recorded",
+    "demand_from_arrays",
     "Operation",
     "operation",
     "best_ratio",
@@ -85,12 +92,12 @@ __all__ = [
     "TRY_IT",
     "Candidate",
     "choose",
-    "geared",
-    "equal_gears",
-    "uncounted",
+    "with_best_gear",
+    "equivalent_gears",
+    "ignored_quantities",
     "actuators_of",
     "Swing",
-    "least_gain",
-    "least_pumped",
-    "least_voltage",
+    "min_energy_gain",
+    "min_pumped_energy",
+    "min_supply_voltage",
 ]

@@ -1,10 +1,10 @@
-"""Drives by name, what they can do, and what is known of them; closed forms of V = R*I + kE*omega, behind the gear.
+"""Drives by name, their steady-state limits and datasheets; closed forms of V = R*I + kE*omega.
 
-Source: maxon, *Key information on maxon DC and EC motors*; the same relations that
-`codrl_mj.catalogue` derives by. As in the simulation, kT*I passes the gear first, which loses 1 -
-efficiency of it where it drives and brakes with 1/efficiency - 1 more where it is driven; friction,
-n*(c + n*b*|omega|) at the output, opposes the speed behind it. All here is past both: the torque
-that moves the load.
+Source: maxon, *Key information on maxon DC and EC motors*; `codrl_mj.catalogue` derives its numbers
+by the same relations. As in the simulation, kT*I passes the gear first: the gear multiplies a
+driving torque by its efficiency and a braking torque by 1/efficiency. Friction at the output,
+n*(c + n*b*|omega|), opposes the speed after the gear. All torques here are net of both: they move
+the load.
 """
 
 import dataclasses
@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import Drive, GearMotor, Servo, ServoLoop, actuator_over, resolve
-from codrl_mj.catalogue import MotorEntry, MotorNumbers, motor_entry, motor_names
+from codrl_mj.actuators import Drive, GearMotor, Servo, ServoLoop, override_actuator, resolve
+from codrl_mj.catalogue import MotorEntry, MotorParameters, motor_entry, motor_names
 from codrl_mj.catalogue.datasheet import KINDS
-from codrl_mj.catalogue.derivation import OTHER_NAMES
+from codrl_mj.catalogue.derivation import PRINTED_NAMES
 from codrl_mj.fields import check_names
 
 
@@ -31,20 +31,22 @@ def find_drive(
     delayed: bool | None = None,
     max_current: float | None = None,
 ) -> Drive:
-    """A drive by name, of a servo without its outer loops, with single fields set over it; None leaves a field.
+    """Return a drive by name, with overridden fields; None keeps a field.
+
+    A servo is returned without its outer loops.
 
     Args:
-        name: whatever `codrl_mj.actuators.resolve` takes, such as a motor of the catalogue.
+        name: anything that `codrl_mj.actuators.resolve` accepts, such as a catalogue motor.
         gear_ratio: turns of the rotor for a turn of the output.
-        sample_rate: of the current loop [Hz].
-        bandwidth: that the loop's gains are designed for [Hz].
-        voltage: of the supply [V].
-        delayed: whether a sample's voltage is applied in the next one.
-        max_current: that the drive asks for [A].
+        sample_rate: sample rate of the current loop [Hz].
+        bandwidth: bandwidth that the loop's gains are designed for [Hz].
+        voltage: voltage of the supply [V].
+        delayed: True to apply a sample's voltage one sample later.
+        max_current: largest reference current of the drive [A].
 
     Raises:
-        ValueError: there is no such actuator (the nearest is suggested), it is no drive, or a value
-            is out of bounds.
+        ValueError: the actuator is unknown (the nearest name is suggested) or is not a drive, or a
+            value is out of bounds.
     """
     loop = {
         "sample_rate": sample_rate,
@@ -59,91 +61,101 @@ def find_drive(
     }
     base = resolve(name, None, "a motor on its own")
     if isinstance(base, Servo):
-        base = actuator_over(base, {"family": Drive.family})
+        base = override_actuator(base, {"family": Drive.family})
     if type(base) is not Drive:
         raise ValueError(
             f"motor = {name!r}: no motor behind a drive, but the actuator family {base.family};"
             " name a motor of the catalogue (codrl-mj motor list), a TOML file with a datasheet,"
             " or an actuator of the family drive"
         )
-    given = {
-        part: {key: value for key, value in to.items() if value is not None}
-        for part, to in changes.items()
+    overrides = {
+        part: {key: value for key, value in fields.items() if value is not None}
+        for part, fields in changes.items()
     }
-    return actuator_over(base, given)
+    return override_actuator(base, overrides)
 
 
 def find_entry(name: Any) -> MotorEntry | None:
-    """The datasheet that a name of `find_drive` stands for; None where it is not one's."""
+    """Return the datasheet behind a name of `find_drive`; None if it has no datasheet."""
     known = isinstance(name, str) and (name in motor_names() or name.endswith(".toml"))
     return motor_entry(name) if known else None
 
 
 class Abilities(NamedTuple):
-    """What a drive can do at its supply's voltage, `max_current` aside in all but power and peak torque."""
+    """Limits of a drive at its supply's voltage.
+
+    Only power and peak torque include `max_current`.
+    """
 
     power: float
-    """The most mechanical power [W] of the motor, gear and friction aside: see `most_power`."""
+    """Largest mechanical power [W] of the motor, without gear and friction: see `max_power`."""
     peak_torque: float
-    """As the stall torque [N*m], within `max_current`."""
+    """Stall torque [N*m] within `max_current`."""
 
     stall_torque: float
-    """Of the output that just turns [N*m]; a gear does not lose anything where it stands still."""
+    """Largest torque at the output just before it turns [N*m]."""
     stall_current: float
-    """Of the blocked motor [A]: V/R."""
+    """Current of the blocked motor [A]: V/R."""
     no_load_speed: float
-    """Of the free output [rad/s]; infinite without back-EMF and viscous friction."""
+    """Speed of the free output [rad/s]; infinite without back-EMF and viscous friction."""
     no_load_current: float
-    """Of the free motor [A], which overcomes its friction."""
+    """Current of the free motor [A], which overcomes its friction."""
     electrical_time_constant: float
-    """L/R [s]."""
+    """Electrical time constant L/R [s]."""
     mechanical_time_constant: float
-    """Of the free motor's speed [s], R*J/(kT*kE), at the rotor; NaN where its inertia is not known: 0."""
+    """Mechanical time constant R*J/(kT*kE) of the rotor [s]; NaN if its inertia is unknown (0)."""
 
 
 ABILITY_UNITS = dict(
     zip(Abilities._fields, ("W", "N*m", "N*m", "A", "rad/s", "A", "s", "s"), strict=True)
 )
-"""Their units."""
+"""Units of the fields of `Abilities`."""
 
 
 def abilities(drive: Drive) -> Abilities:
-    """What a drive can do."""
-    motor, resistance = drive.motor, drive.motor.resistance + drive.sag
-    passed = motor.torque_constant * motor.gear_efficiency  # [N*m/A]
-    per_torque = resistance / passed  # [V/(N*m)]
-    slope = motor.back_emf_constant + per_torque * motor.viscous_friction
-    left = max(drive.voltage_limit - per_torque * motor.coulomb_friction, 0.0)
-    speed = left / slope if slope > 0.0 else math.inf
+    """Return the limits of a drive."""
+    motor, resistance = drive.motor, drive.motor.resistance + drive.supply_resistance
+    torque_per_current = motor.torque_constant * motor.gear_efficiency  # [N*m/A]
+    voltage_per_torque = resistance / torque_per_current  # [V/(N*m)]
+    slope = motor.back_emf_constant + voltage_per_torque * motor.viscous_friction
+    effective_voltage = max(drive.voltage_limit - voltage_per_torque * motor.coulomb_friction, 0.0)
+    speed = effective_voltage / slope if slope > 0.0 else math.inf
     friction = motor.coulomb_friction + (
         motor.viscous_friction * speed if motor.viscous_friction > 0.0 else 0.0
     )
-    stall = drive.voltage_limit / resistance
-    peak, blocked = _at_output(
-        motor, np.array([min(stall, drive.controller.max_current), stall]), np.zeros(2)
+    stall_current = drive.voltage_limit / resistance
+    peak_torque, blocked_torque = _at_output(
+        motor,
+        np.array([min(stall_current, drive.controller.max_current), stall_current]),
+        np.zeros(2),
     )
     return Abilities(
-        most_power(drive),
-        float(peak),
-        float(blocked),
-        stall,
+        max_power(drive),
+        float(peak_torque),
+        float(blocked_torque),
+        stall_current,
         speed / motor.gear_ratio,
-        friction / passed,
+        friction / torque_per_current,
         motor.electrical_time_constant,
         motor.mechanical_time_constant if motor.rotor_inertia > 0.0 else math.nan,
     )
 
 
-def most_power(drive: Drive) -> float:
-    """The most mechanical power [W], i (V - R i) kT/kE, R of winding and supply; infinite without back-EMF."""
-    motor, limit, resistance = drive.motor, drive.voltage_limit, drive.motor.resistance + drive.sag
+def max_power(drive: Drive) -> float:
+    """Return the largest mechanical power [W], i (V - R i) kT/kE; infinite without back-EMF."""
+    # R is the resistance of winding and supply. The power is maximal at half the stall current.
+    motor, limit, resistance = (
+        drive.motor,
+        drive.voltage_limit,
+        drive.motor.resistance + drive.supply_resistance,
+    )
     current = min(limit / resistance / 2, drive.controller.max_current)
     power = current * (limit - resistance * current) * motor.torque_constant
     return power / motor.back_emf_constant if motor.back_emf_constant else math.inf
 
 
 def continuous_torque(drive: Drive, current: float | None) -> float | None:
-    """Torque [N*m] that the output that just turns bears for ever, by the winding's current [A]; None: not known."""
+    """Return the standstill torque [N*m] of a continuous current [A]; None if unknown."""
     return (
         None
         if current is None
@@ -152,22 +164,25 @@ def continuous_torque(drive: Drive, current: float | None) -> float | None:
 
 
 def diagram_limits(drive: Drive, numbers: Any = None) -> list[tuple[str, float, int]]:
-    """The limits in a torque-speed diagram: name, current [A], and 0 of the voltage (infinite), 1 peak, 2 continuous.
+    """Return the limits in a torque-speed diagram, each as (name, current [A], kind).
+
+    The kind is 0 for the voltage limit (its current is infinite), 1 for the peak current and 2 for
+    the continuous current.
 
     Raises:
-        ValueError: the drive has no no-load speed to end the diagram at.
+        ValueError: the drive has no finite no-load speed, which ends the diagram.
     """
-    can, most = abilities(drive), drive.controller.max_current
-    if not 0.0 < can.no_load_speed < math.inf or can.stall_torque <= 0.0:
+    limits, peak_current = abilities(drive), drive.controller.max_current
+    if not 0.0 < limits.no_load_speed < math.inf or limits.stall_torque <= 0.0:
         raise ValueError(
             f"GearMotor.back_emf_constant = {drive.motor.back_emf_constant:g}, Supply.voltage ="
-            f" {drive.voltage_limit:g}: the no-load speed is {can.no_load_speed:g} rad/s and the"
-            f" stall torque {can.stall_torque:g} N*m, must be finite and > 0 for a torque-speed"
+            f" {drive.voltage_limit:g}: the no-load speed is {limits.no_load_speed:g} rad/s and the"
+            f" stall torque {limits.stall_torque:g} N*m, must be finite and > 0 for a torque-speed"
             " diagram; give a back-EMF constant, and a voltage that overcomes the friction"
         )
     lines = [(f"voltage, {drive.voltage_limit:g} V", math.inf, 0)]
-    if math.isfinite(most):
-        lines.append((f"peak current, {most:.3g} A", most, 1))
+    if math.isfinite(peak_current):
+        lines.append((f"peak current, {peak_current:.3g} A", peak_current, 1))
     continuous = getattr(numbers, "continuous_current", None)
     return (
         lines
@@ -179,18 +194,18 @@ def diagram_limits(drive: Drive, numbers: Any = None) -> list[tuple[str, float, 
 def torque_limits(
     drive: Drive, speeds: Any, current: float = math.inf
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The lowest and the highest steady torque [N*m] at the output, by voltage and current.
+    """Return the lowest and highest steady torque [N*m] at the output.
 
-    Above the no-load speed the back-EMF alone drives a current, whatever the limit of it.
+    Above the no-load speed the back-EMF drives a current regardless of the current limit.
 
     Args:
-        drive: whose.
-        speeds: of the output [rad/s], any shape.
-        current: within plus and minus this [A], such as the drive's `max_current`.
+        drive: the drive.
+        speeds: speeds of the output [rad/s], any shape.
+        current: limit of the absolute current [A], such as the drive's `max_current`.
     """
     speeds = np.asarray(speeds, dtype=float)
     back_emf = drive.motor.back_emf_constant * drive.motor.gear_ratio * speeds
-    winding = drive.motor.resistance, drive.voltage_limit, drive.sag
+    winding = drive.motor.resistance, drive.voltage_limit, drive.supply_resistance
     lowest, highest = -highest_current(*winding, -back_emf), highest_current(*winding, back_emf)
     low, high = (np.clip(bound, lowest, highest) for bound in (-current, current))
     return _at_output(drive.motor, low, speeds), _at_output(drive.motor, high, speeds)
@@ -199,25 +214,30 @@ def torque_limits(
 def highest_current(
     resistance: float, voltage: float, sag: float, back_emf: np.ndarray
 ) -> np.ndarray:
-    """Highest steady current [A] of a winding R: that of u = max(V - Rs*|i|, 0), Rs the sag; at u = 0 it is -b/R."""
-    against = max(resistance - sag, 1e-9 * resistance)  # where i < 0, beyond the no-load speed
-    driven = (voltage - back_emf) / np.where(back_emf > voltage, against, resistance + sag)
+    """Return the highest steady current [A] of a winding, for u = max(V - sag*|i|, 0)."""
+    # Beyond the no-load speed i < 0, so that u = V + sag*i and (R - sag)*i = V - b. At u = 0 the
+    # back-EMF b alone drives -b/R, which is the lower bound.
+    reverse_resistance = max(resistance - sag, 1e-9 * resistance)
+    driven = (voltage - back_emf) / np.where(
+        back_emf > voltage, reverse_resistance, resistance + sag
+    )
     return np.maximum(driven, -back_emf / resistance)
 
 
 def _at_output(motor: GearMotor, current: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    """Torque [N*m] that a current [A] leaves at the output, at its speed [rad/s]."""
+    """Return the net torque [N*m] at the output, for a current [A] and an output speed [rad/s]."""
     torque = motor.torque_constant * current
     torque = torque * np.where(
         torque * speed >= 0.0, motor.gear_efficiency, 1.0 / motor.gear_efficiency
     )
     friction = motor.coulomb_friction + motor.viscous_friction * motor.gear_ratio * np.abs(speed)
     friction = friction + motor.stribeck(motor.gear_ratio * speed)
+    # At standstill friction only cancels torque; it never moves the joint.
     still = np.sign(torque) * np.maximum(np.abs(torque) - friction, 0.0)
     return motor.gear_ratio * np.where(speed == 0.0, still, torque - friction * np.sign(speed))
 
 
-# -- what is known of them ----------------------------------------------------------------------------------------
+# -- datasheets ------------------------------------------------------------------------------------
 
 COLUMNS = (
     *(
@@ -233,27 +253,29 @@ COLUMNS = (
     *Abilities._fields,
     "continuous_torque",
 )
-"""What a row of `catalogue_rows` has, in SI."""
+"""Columns of `catalogue_rows`, in SI units."""
 _ROUNDED = 0.01
-"""Relative difference up to which a datasheet's values are taken to be rounded."""
+"""Relative difference below which a disagreement of a datasheet counts as rounding."""
 
 
 def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
-    """Every motor of the catalogue at its nominal voltage, or 24 V; None where a number is not known.
+    """Return a row for every catalogue motor at its nominal voltage, or 24 V; None if unknown.
 
     Args:
-        sort: one of `COLUMNS`: names and kinds from A, numbers from the highest, unknown ones last.
+        sort: one of `COLUMNS`: names and kinds from A to Z, numbers descending, unknown ones last.
 
     Raises:
-        ValueError: there is no such column; the nearest is suggested.
+        ValueError: the column is unknown; the nearest name is suggested.
     """
     check_names([sort], COLUMNS, "column")
     rows = []
     for entry in map(motor_entry, motor_names()):
-        numbers, drive = entry.numbers, Drive.of(entry.numbers)
-        can = abilities(drive)._asdict()
+        numbers, drive = entry.parameters, Drive.from_motor_parameters(entry.parameters)
+        capabilities = abilities(drive)._asdict()
         known = {name: getattr(numbers, name) for name in COLUMNS[2:8]}
-        known |= {name: value if math.isfinite(value) else None for name, value in can.items()}
+        known |= {
+            name: value if math.isfinite(value) else None for name, value in capabilities.items()
+        }
         known["continuous_torque"] = continuous_torque(drive, numbers.continuous_current)
         rows.append({"name": entry.name, "kind": entry.kind, **known})
     if sort in ("name", "kind"):
@@ -262,7 +284,7 @@ def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
 
 
 def find_loop(name: Any) -> ServoLoop | None:
-    """Return the outer loops of the servo that a name of `find_drive` stands for; None where it is no servo's."""
+    """Return the outer loops of a servo, by a name of `find_drive`; None if it is not a servo."""
     base = resolve(name, None, "a motor on its own")
     return base.loop if isinstance(base, Servo) else None
 
@@ -270,19 +292,19 @@ def find_loop(name: Any) -> ServoLoop | None:
 def explain(
     drive: Drive, entry: MotorEntry | None = None, loop: ServoLoop | None = None
 ) -> dict[str, Any]:
-    """All that is known of a motor: JSON-serialisable but for infinite values.
+    """Return all known data of a motor: JSON-serializable, except for infinite values.
 
     Args:
         drive: the motor with its drive.
-        entry: its datasheet, where it has one.
-        loop: the outer loops, where it is a servo's.
+        entry: its datasheet, if it has one.
+        loop: the outer loops, if it is a servo.
 
     Returns:
-        `drive`, the fields of motor, controller, supply and loop, and `abilities`, each a list of
-        mappings with `name`, `value` and `unit`; `assumed`; and of a datasheet `manufacturer`,
-        `product`, `kind`, `numbers`, such mappings with `how` it came about, its `sources` and
-        their `places`, from 1, among all that are `cited`, `unknown`, `disagreements`, `estimated`
-        and `notes`.
+        `drive` (the fields of motor, controller, supply and loop) and `abilities`, each a list of
+        mappings with `name`, `value` and `unit`; `assumed`; and for a datasheet `manufacturer`,
+        `product`, `kind`, `numbers`, `cited`, `unknown`, `disagreements`, `estimated` and `notes`.
+        Each mapping in `numbers` also has its derivation `how`, its `sources`, and `places`, their
+        positions in `cited`, from 1.
     """
     parts: dict[str, Any] = {
         "motor": drive.motor,
@@ -290,7 +312,7 @@ def explain(
         "supply": drive.supply,
     }
     parts["loop"] = loop
-    found: dict[str, Any] = {
+    report: dict[str, Any] = {
         "drive": [
             _value(
                 f"{part}.{field.name}", getattr(owner, field.name), field.metadata.get("unit", "")
@@ -306,44 +328,56 @@ def explain(
         "assumed": drive.assumed,
     }
     if entry is None:
-        return found
-    torque = continuous_torque(drive, entry.numbers.continuous_current)
-    found["abilities"].insert(2, _value("continuous_torque", torque, "N*m"))
+        return report
+    torque = continuous_torque(drive, entry.parameters.continuous_current)
+    report["abilities"].insert(2, _value("continuous_torque", torque, "N*m"))
     names = [
         field.name
-        for field in dataclasses.fields(MotorNumbers)
+        for field in dataclasses.fields(MotorParameters)
         if field.name not in ("derived", "disagreements")
     ]
-    derived = entry.numbers.derived
+    derived = entry.parameters.derived
     sources = {name: _sources(derived[name], entry) for name in names if name in derived}
-    cited = list(dict.fromkeys(source for several in sources.values() for source in several))
+    cited = list(
+        dict.fromkeys(
+            source for names_of_sources in sources.values() for source in names_of_sources
+        )
+    )
     rounded = [
-        one.quantity for one in entry.numbers.disagreements if abs(one.difference) < _ROUNDED
+        disagreement.quantity
+        for disagreement in entry.parameters.disagreements
+        if abs(disagreement.difference) < _ROUNDED
     ]
-    told = [str(one) for one in entry.numbers.disagreements if one.quantity not in rounded]
+    reported = [
+        str(disagreement)
+        for disagreement in entry.parameters.disagreements
+        if disagreement.quantity not in rounded
+    ]
     if rounded:
-        told.append(f"less than {_ROUNDED:.0%}, by rounding: {', '.join(rounded)}")
-    return found | {
+        reported.append(f"less than {_ROUNDED:.0%}, by rounding: {', '.join(rounded)}")
+    return report | {
         **{name: getattr(entry, name) for name in ("manufacturer", "product", "kind")},
         "numbers": [
-            _value(name, getattr(entry.numbers, name), KINDS[OTHER_NAMES.get(name, name)].unit)
+            _value(name, getattr(entry.parameters, name), KINDS[PRINTED_NAMES.get(name, name)].unit)
             | {
                 "how": derived[name],
-                "sources": own,
-                "places": ", ".join(str(1 + cited.index(one)) for one in own),
+                "sources": own_sources,
+                "places": ", ".join(
+                    str(1 + cited.index(disagreement)) for disagreement in own_sources
+                ),
             }
-            for name, own in sources.items()
+            for name, own_sources in sources.items()
         ],
         "cited": cited,
         "unknown": [name for name in names if name not in derived],
-        "disagreements": told,
+        "disagreements": reported,
         "estimated": dict(entry.estimated),
         "notes": entry.notes,
     }
 
 
-def unknown_in_words(names: Sequence[str]) -> str:
-    """What is said of a motor's unknown numbers; empty where all are known."""
+def describe_unknown(names: Sequence[str]) -> str:
+    """Return a sentence on the unknown numbers of a motor; empty if all are known."""
     words = ", ".join(name.replace("max_", "highest ").replace("_", " ") for name in names)
     return (
         f"Not known: {words} (no source has it, and no other number implies it)." if words else ""
@@ -355,7 +389,7 @@ def _value(name: str, value: Any, unit: str) -> dict[str, Any]:
 
 
 def _sources(sentence: str, entry: MotorEntry) -> list[str]:
-    """Where the printed values that a sentence of `MotorNumbers.derived` names were found."""
+    """Return the sources of the values that a sentence of `MotorParameters.derived` names."""
     known = (
         entry.sources.get(word) for word in re.findall(r"\w+", sentence.replace("_at_output", ""))
     )

@@ -1,4 +1,4 @@
-"""The choice of a motor and of its gear: the smallest that does it with a margin."""
+"""Choice of a motor and its gear: the smallest motor that meets a demand with a margin."""
 
 import math
 import re
@@ -10,11 +10,11 @@ import numpy as np
 
 from codrl_mj.actuators import Drive, named_mapping, set_display_name
 from codrl_mj.catalogue import MotorEntry, motor_names
-from codrl_mj.sizing.abilities import find_drive, find_entry, most_power
+from codrl_mj.sizing.abilities import find_drive, find_entry, max_power
 from codrl_mj.sizing.demand import Demand
 from codrl_mj.sizing.feasibility import (
-    MOST_FRICTION,
-    MOST_SHARE,
+    MAX_FRICTION_SHARE,
+    MAX_ROTOR_SHARE,
     SURELY,
     VERDICTS,
     Feasibility,
@@ -26,140 +26,162 @@ from codrl_mj.sizing.feasibility import (
 )
 
 MARGIN = 0.2
-"""Share of voltage and currents that a motor is to leave: a rule of thumb, for the tolerances of motor and supply."""
+"""Required margin of voltage and currents: a rule of thumb for tolerances of motor and supply."""
 _SPREAD = math.log(16.0)
-"""Gears are tried up to this far, in logarithms, from that of the largest torque and the largest speed."""
-_WANTED = ("coulomb_friction", "viscous_friction", "gear_efficiency", "continuous_current")
-"""What a datasheet may leave open, and is not counted then, besides what `Drive.assumed` says."""
+"""Search range of log(gear ratio) on either side of the ratio for largest torque and speed."""
+_OPTIONAL_NUMBERS = (
+    "coulomb_friction",
+    "viscous_friction",
+    "gear_efficiency",
+    "continuous_current",
+)
+"""Numbers that are ignored if a datasheet omits them, besides those in `Drive.assumed`."""
 
 
 class Candidate(NamedTuple):
-    """A motor with a gear, judged."""
+    """Motor with a gear, and its judgment."""
 
     name: str
-    """Of the motor."""
+    """Name of the motor."""
     drive: Drive
-    """The motor with gear and supply."""
+    """Motor with gear and supply."""
     unknown: tuple[str, ...]
-    """Numbers that its datasheet leaves open, and that are not counted."""
+    """Numbers that its datasheet omits and that are ignored."""
     feasibility: Feasibility
-    """The judgment."""
-    lacks: str
-    """The reason why it is not to be taken; empty where it is."""
+    """Judgment of the motor."""
+    rejection_reason: str
+    """Reason why it is rejected; empty if it is suitable."""
 
-    def behind(self, gear: float) -> Drive:
-        """The drive for an actuator of a model with a gear of its own, which the arm undoes: `Demand.model_gear`."""
+    def for_model_gear(self, gear: float) -> Drive:
+        """Return the drive for an actuator whose model has a gear (`Demand.model_gear`)."""
+        # The model multiplies the force by its gear; a larger arm divides it again.
         return self.drive.replaced({"motor.arm_radius": gear * self.drive.motor.arm_radius})
 
     @property
     def power(self) -> float:
-        """The most mechanical power [W] that the motor makes at its supply: its size, whatever its winding and gear."""
-        return most_power(self.drive)
+        """Largest mechanical power [W]: the motor's size, regardless of winding and gear."""
+        return max_power(self.drive)
 
     @property
     def ratio(self) -> float:
-        """Turns of the rotor for one of the joint; on a slide rad/m."""
+        """Gear ratio: turns of the rotor for one turn of the joint; on a slide [rad/m]."""
         return 1.0 / self.drive.arm_radius
 
 
 def actuators_of(choices: Mapping[str, tuple[Candidate, Demand]]) -> dict[str, Any]:
-    """What `codrl_mj.make` and `--actuators` take: pattern -> fields of the actuator.
+    """Return pattern -> fields of the actuator, as `codrl_mj.make` and `--actuators` accept it.
 
     Args:
-        choices: name of a motor of the model -> what was chosen for it, and for what; of a single
-            one the name may be empty.
+        choices: name of a motor in the model -> chosen candidate and its demand; the name may be
+            empty if there is only one motor.
     """
-    found = {}
+    actuators = {}
     for name, (choice, demand) in choices.items():
-        drive = set_display_name(choice.behind(demand.model_gear), Path(choice.name).stem)
-        found[" & ".join(map(re.escape, name.split(" & "))) if name else ".*"] = named_mapping(
+        drive = set_display_name(choice.for_model_gear(demand.model_gear), Path(choice.name).stem)
+        actuators[" & ".join(map(re.escape, name.split(" & "))) if name else ".*"] = named_mapping(
             drive
         )
-    return found
+    return actuators
 
 
-def uncounted(entry: MotorEntry | None) -> tuple[str, ...]:
-    """What a motor's datasheet leaves open, and is not counted; of a drive without one that is all of its heat."""
+def ignored_quantities(entry: MotorEntry | None) -> tuple[str, ...]:
+    """Return the quantities that a judgment ignores because the datasheet omits them.
+
+    Without a datasheet the continuous current is unknown, so heat is ignored.
+    """
     if entry is None:
         return ("continuous current",)
-    return tuple(name.replace("_", " ") for name in _WANTED if getattr(entry.numbers, name) is None)
+    return tuple(
+        name.replace("_", " ")
+        for name in _OPTIONAL_NUMBERS
+        if getattr(entry.parameters, name) is None
+    )
 
 
 def choose(
     demand: Demand,
     motors: Sequence[str] | None = None,
     voltage: float | None = None,
-    least_margin: float = MARGIN,
+    min_margin: float = MARGIN,
     gears: Sequence[float] | None = None,
     max_current: float | None = None,
 ) -> list[Candidate]:
-    """Rank motors with their gears: those that do it, from the smallest; then the others by verdict and shortage.
+    """Rank motors with gears: suitable ones by size, then the others by verdict and shortage.
 
-    A motor does it if `feasibility` says `surely`, with a margin. More than enough of a motor is no
-    merit: it is dear and heavy, and moves itself. A motor with a gear of its own keeps it, and on a
-    slide gets a wheel; the others get the gear of `geared`.
+    A motor is suitable if `feasibility` returns `surely` with a margin. A larger motor than needed
+    is no advantage: it is expensive and heavy, and accelerates its own rotor. A motor with a gear
+    keeps it, and on a slide gets a wheel; the others get the gear of `with_best_gear`.
 
     Args:
-        demand: what is asked.
-        motors: names; None: the whole catalogue.
-        voltage: of the supply [V]; None: each motor's own.
-        least_margin: share of voltage, largest and continuous current that has to be left, in [0,
-            1).
-        gears: ratios that can be had, turns of the rotor for one of the joint, on a slide rad/m;
+        demand: the demand.
+        motors: names; None takes the whole catalogue.
+        voltage: voltage of the supply [V]; None takes each motor's nominal one.
+        min_margin: required margin of voltage, largest and continuous current, in [0, 1).
+        gears: available ratios, turns of the rotor for one turn of the joint, on a slide [rad/m];
             every motor is judged with each of them.
-        max_current: that the drive gives [A]; None: each motor's own.
+        max_current: largest current of the drive [A]; None takes each motor's.
 
     Raises:
-        ValueError: there is no such motor, or the margin or a gear is out of bounds.
+        ValueError: a motor is unknown, or the margin or a gear is out of bounds.
     """
-    if not 0.0 <= least_margin < 1.0:
+    if not 0.0 <= min_margin < 1.0:
         raise ValueError(
-            f"least_margin = {least_margin:g}: must be >= 0 and < 1, the share that is to be left,"
+            f"min_margin = {min_margin:g}: must be >= 0 and < 1, the required share that is left,"
             f" such as {MARGIN:g}"
         )
     choices = []
     for name in motor_names() if motors is None else motors:
         entry = find_entry(name)
-        continuous = entry.numbers.continuous_current if entry else None
+        continuous = entry.parameters.continuous_current if entry else None
         for gear in gears or (None,):
             drive = find_drive(name, gear, voltage=voltage, max_current=max_current)
             fixed = gear is not None or (drive.motor.gear_ratio != 1.0 and not demand.linear)
-            drive = drive if fixed else geared(drive, demand, continuous)
-            found = feasibility(drive, demand, continuous)
+            drive = drive if fixed else with_best_gear(drive, demand, continuous)
+            judgment = feasibility(drive, demand, continuous)
             choices.append(
-                Candidate(name, drive, uncounted(entry), found, _lacks(found, least_margin))
+                Candidate(
+                    name,
+                    drive,
+                    ignored_quantities(entry),
+                    judgment,
+                    _rejection_reason(judgment, min_margin),
+                )
             )
 
     def rank(choice: Candidate) -> tuple[bool, int, float, float]:
-        found = choice.feasibility
-        size = 0.0 if choice.lacks else choice.power
-        return choice.lacks != "", VERDICTS.index(found.verdict), size, found.shortage
+        judgment = choice.feasibility
+        size = 0.0 if choice.rejection_reason else choice.power
+        return (
+            choice.rejection_reason != "",
+            VERDICTS.index(judgment.verdict),
+            size,
+            judgment.shortage,
+        )
 
     return sorted(choices, key=rank)
 
 
-def _lacks(found: Feasibility, least: float) -> str:
-    """Return the reason why a motor is not to be taken; empty where it is."""
-    if found.verdict != SURELY:
-        return f"{found.verdict}. {found.why}"
+def _rejection_reason(judgment: Feasibility, min_margin: float) -> str:
+    """Return the reason why a motor is rejected; empty if it is suitable."""
+    if judgment.verdict != SURELY:
+        return f"{judgment.verdict}. {judgment.reason}"
     return (
         ""
-        if found.margin >= least
-        else f"surely, but with a margin of {found.margin:.0%}, must be {least:.0%}"
+        if judgment.margin >= min_margin
+        else f"surely, but with a margin of {judgment.margin:.0%}, must be {min_margin:.0%}"
     )
 
 
-def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Drive:
-    """Return the drive with its best gear, or on a slide wheel: that of the largest margin, rotor and friction counted.
+def with_best_gear(drive: Drive, demand: Demand, continuous: float | None = None) -> Drive:
+    """Return the drive with the gear (or wheel, on a slide) of the largest margin.
 
-    A gear has a ratio >= 1. Friction may take `MOST_FRICTION` of the load where that leaves a
-    margin. Each of the margin's parts is, but for friction, the largest of functions a/N + b*N, so
-    it has one maximum over N.
+    The ratio is >= 1. If possible with a positive margin, Coulomb friction takes at most
+    `MAX_FRICTION_SHARE` of the load.
 
     Args:
         drive: the motor, with any gear.
-        demand: what is asked.
-        continuous: current that the winding bears for good [A]; None: unknown.
+        demand: the demand.
+        continuous: continuous current of the winding [A]; None if unknown.
     """
     from scipy.optimize import minimize_scalar
 
@@ -167,51 +189,55 @@ def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Dri
     if low == high:
         return drive
 
+    # Except for friction, each part of the load is a maximum of functions a/N + b*N of the ratio N.
+    # It has one minimum over N, which a bounded scalar search finds.
     def load(logarithm: float) -> float:
         with_gear = _with_ratio(drive, demand, logarithm)
-        asked = operation(demand, with_gear)
-        share = 0.0 if demand.exact else asked.own_share / MOST_SHARE
-        return max(1.0 - margin(with_gear, asked, continuous), share)
+        required = operation(demand, with_gear)
+        own_load = 0.0 if demand.exact else required.own_share / MAX_ROTOR_SHARE
+        return max(1.0 - margin(with_gear, required, continuous), own_load)
 
-    def best(highest: float) -> Drive:
+    def best_below(highest: float) -> Drive:
         within = low, max(min(highest, high), low + 1e-9)
-        at = minimize_scalar(load, bounds=within, method="bounded", options={"xatol": 0.01}).x
-        return _with_ratio(drive, demand, float(at))
+        optimum = minimize_scalar(load, bounds=within, method="bounded", options={"xatol": 0.01}).x
+        return _with_ratio(drive, demand, float(optimum))
 
-    rubbed = (
-        0.0 if demand.exact else friction_share(_with_ratio(drive, demand, 0.0), demand)
-    )  # it grows with the ratio
-    if rubbed > 0.0 and MOST_FRICTION / rubbed > math.exp(low):
-        smooth = best(math.log(MOST_FRICTION / rubbed))
+    # Friction at the joint grows with the ratio, so its limit is an upper bound on the ratio.
+    friction = 0.0 if demand.exact else friction_share(_with_ratio(drive, demand, 0.0), demand)
+    if friction > 0.0 and MAX_FRICTION_SHARE / friction > math.exp(low):
+        smooth = best_below(math.log(MAX_FRICTION_SHARE / friction))
         if margin(smooth, operation(demand, smooth), continuous) >= 0.0:
             return smooth
-    return best(math.inf)
+    return best_below(math.inf)
 
 
-def equal_gears(
+def equivalent_gears(
     best: Drive, demand: Demand, continuous: float | None = None
 ) -> tuple[float, float]:
-    """Return the lowest and the highest ratio around the best one that have its verdict."""
+    """Return the lowest and highest ratio around the best one with the same verdict."""
     verdict, middle = feasibility(best, demand, continuous).verdict, -math.log(best.arm_radius)
 
-    def edge(beyond: float) -> float:
-        within = middle
+    def edge(outside: float) -> float:
+        inside = middle
+        # Bisection: 12 halvings resolve the ratio better than any catalogue of gears.
         for _ in range(12):
-            tried = (within + beyond) / 2.0
-            same = (
-                feasibility(_with_ratio(best, demand, tried), demand, continuous).verdict == verdict
+            candidate = (inside + outside) / 2.0
+            has_same_verdict = (
+                feasibility(_with_ratio(best, demand, candidate), demand, continuous).verdict
+                == verdict
             )
-            within, beyond = (tried, beyond) if same else (within, tried)
-        return math.exp(within)
+            inside, outside = (candidate, outside) if has_same_verdict else (inside, candidate)
+        return math.exp(inside)
 
     low, high = _logarithms(best, demand)
     return edge(low), edge(high)
 
 
 def _logarithms(drive: Drive, demand: Demand) -> tuple[float, float]:
-    """Return the logarithms of the lowest and the highest ratio to try: the drive's own where all are alike.
+    """Return the logarithms of the lowest and highest ratio to try.
 
-    A gear does not speed a motor up.
+    Both are the drive's ratio if the ratio makes no difference. The lowest ratio of a rotary joint
+    is 1: a gear does not raise the speed.
     """
     torque, speed = np.abs(demand.torque).max(), np.abs(demand.speed).max()
     if not torque * speed * drive.motor.back_emf_constant > 0.0:
@@ -222,7 +248,7 @@ def _logarithms(drive: Drive, demand: Demand) -> tuple[float, float]:
 
 
 def _with_ratio(drive: Drive, demand: Demand, logarithm: float) -> Drive:
-    """Return the drive with a ratio of exp(logarithm), by its gear, or on a slide by its wheel."""
+    """Return the drive with a ratio of exp(logarithm), by its gear or a slide's wheel."""
     ratio = math.exp(logarithm)
     if demand.linear:
         return drive.replaced({"motor.arm_radius": drive.motor.gear_ratio / ratio})

@@ -1,4 +1,4 @@
-"""What a task asks of an actuator: the joint's torque and speed at every integration step of runs on the ideal one."""
+"""Demand of a task on a motor: torque and speed of the joint in runs on the ideal actuator."""
 
 import contextlib
 import dataclasses
@@ -15,90 +15,92 @@ from codrl_mj.fields import did_you_mean
 from codrl_mj.sizing.swing import Swing
 
 EPISODES = 10
-"""Episodes that a demand is taken from unless told otherwise."""
+"""Default number of episodes for a demand."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Demand:
-    """The operating points of one joint over T steps; of a slide in N, m/s and m/s^2.
+    """Operating points of one joint over T steps; on a slide in N, m/s and m/s^2.
 
-    Where the task stops the joint, at walls and limits of its speed, `acceleration` is that of the
-    stop: it asks the motor for more than the wall would.
+    Where the task stops the joint, at walls and speed limits, `acceleration` includes the stop. The
+    demand is then conservative, because in reality the wall decelerates the rotor, not the motor.
     """
 
     source: str
-    """Where it is from, in words."""
+    """Description of the origin."""
     duration: np.ndarray
-    """Of each step [s], shape (T,)."""
+    """Duration of each step [s], shape (T,)."""
     torque: np.ndarray
     """Torque at the joint [N*m], shape (T,)."""
     speed: np.ndarray
-    """Speed of the joint [rad/s] at the step's start, shape (T,): what a drive sees in it."""
+    """Speed of the joint [rad/s] at the start of each step, shape (T,), as the drive sees it."""
     acceleration: np.ndarray
-    """Of the joint [rad/s^2], by differences, shape (T,)."""
+    """Acceleration of the joint [rad/s^2], by differences, shape (T,)."""
     episodes: int = 1
-    """How many runs it holds."""
+    """Number of episodes."""
     exact: bool = False
-    """Whether it has to be delivered as it is; otherwise another policy may do the task with less."""
+    """True if the motor must follow it exactly. If False, another policy may need less."""
     linear: bool = False
-    """Whether the joint is a slide."""
+    """True if the joint is a slide."""
     servo: bool = False
-    """True if the model's own position or velocity servo makes the torque; with less torque it arrives later."""
+    """True if a position or velocity servo of the model makes the torque. It tolerates less torque
+    and then moves more slowly.
+    """
     swing: Swing | None = None
-    """The pendulum, where the task is to swing one up."""
+    """Pendulum of a swing-up task; None for other tasks."""
     model_gear: float = 1.0
-    """Of the model's actuator, of somebody else's: what turns its force into the joint's torque;
-    the motor's gear, and what is asked of it, are at the joint.
+    """Gear of the actuator in a third-party model, which converts its force into joint torque. The
+    demand and the motor's gear refer to the joint.
     """
 
 
 def demand_of(
-    what: str | Path,
+    subject: str | Path,
     episodes: int = EPISODES,
     seed: int = 0,
     trust: bool = False,
     motor: str | None = None,
 ) -> Demand:
-    """What a task, a trained run or a recording asks of an actuator: `demands_of`, of the `motor` that is named.
+    """Return the demand of a task, run or recording on one motor; arguments as in `demands_of`.
 
     Raises:
-        ValueError: as `demands_of`; or there are several motors and none of them is named, or
-            another.
+        ValueError: as in `demands_of`; or `motor` is unknown, or missing if there are several.
     """
-    found = demands_of(what, episodes, seed, trust)
-    if motor is None and len(found) > 1:
-        raise ValueError(f"{what} has {len(found)} motors: motor must be one of {', '.join(found)}")
+    demands = demands_of(subject, episodes, seed, trust)
+    if motor is None and len(demands) > 1:
+        raise ValueError(
+            f"{subject} has {len(demands)} motors: motor must be one of {', '.join(demands)}"
+        )
     if motor is None:
-        return next(iter(found.values()))
-    if motor not in found:
-        names = ", ".join(name for name in found if name) or "none that has a name: leave it out"
-        raise ValueError(f"motor = {motor!r}: {did_you_mean(motor, found)}there are {names}")
-    return found[motor]
+        return next(iter(demands.values()))
+    if motor not in demands:
+        names = ", ".join(name for name in demands if name) or "none that has a name: leave it out"
+        raise ValueError(f"motor = {motor!r}: {did_you_mean(motor, demands)}there are {names}")
+    return demands[motor]
 
 
 def demands_of(
-    what: str | Path, episodes: int = EPISODES, seed: int = 0, trust: bool = False
+    subject: str | Path, episodes: int = EPISODES, seed: int = 0, trust: bool = False
 ) -> dict[str, Demand]:
-    """What a task, a trained run or a recording asks of its motors, by their names; of a single one the name is empty.
+    """Return the demands of a task, run or recording by motor; a single motor has an empty name.
 
     Args:
-        what: a task's name, which a scripted controller drives; the folder of a run that was
-            trained on the ideal actuator, of a task or of an environment of somebody else's; or an
-            `.npz` file with the arrays `time` [s], `torque` [N*m] and `speed` [rad/s] at the joint.
-        episodes: runs to take it from.
-        seed: of the first of them.
-        trust: whether to import the modules of a run folder's task or agent if they are somebody's
-            own.
+        subject: name of a task, which a scripted controller runs; folder of a run that was trained
+            on the ideal actuator; or an `.npz` file with the arrays `time` [s], `torque` [N*m] and
+            `speed` [rad/s] at the joint.
+        episodes: number of episodes.
+        seed: seed of the first episode.
+        trust: whether to import the custom modules of a run folder's task or agent.
 
     Raises:
-        ValueError: it is none of these; the run was trained on another actuator; there is no
-            scripted controller.
+        ValueError: the subject is none of these; the run was trained on another actuator; the task
+            has no scripted controller.
     """
-    path = Path(what)
+    path = Path(subject)
     if path.suffix == ".npz":
         try:
             with np.load(path, allow_pickle=False) as archive:
-                found = recorded(
+                demand = demand_from_arrays(
                     archive["time"],
                     archive["torque"],
                     archive["speed"],
@@ -115,7 +117,7 @@ def demands_of(
             raise ValueError(
                 f"{path}: no recording of the arrays time, torque and speed: {error}"
             ) from None
-        return {"": found}
+        return {"": demand}
     from codrl_mj.envs.config import EnvConfig
     from codrl_mj.evaluation import run_episodes
 
@@ -124,37 +126,38 @@ def demands_of(
         from codrl_mj.training.folder import load_config
 
         env = load_config(path, trust).env
-        if others := [one.family for one in env.actuators if one != IDEAL]:
+        if other_families := [actuator.family for actuator in env.actuators if actuator != IDEAL]:
             raise ValueError(
-                f"{path}: was trained on {others[0]}: must be ideal, whose torques are the task's"
-                " and not a motor's; train it with --actuator ideal, or name the task instead"
+                f"{path}: was trained on {other_families[0]}: must be ideal, whose torques are the"
+                " task's and not a motor's; train it with --actuator ideal, or name the task"
+                " instead"
             )
         env = env.source.as_with_motors(env)
-        ran = run_episodes(load_policy(path, trust), env.make, episodes, seed)
-        return _gathered(f"the policy {path.name} of {env.task}", env, ran)
-    from codrl_mj.sizing.scripted import Scripted, state_observed
+        episodes_run = run_episodes(load_policy(path, trust), env.make, episodes, seed)
+        return _demands_from_episodes(f"the policy {path.name} of {env.task}", env, episodes_run)
+    from codrl_mj.sizing.scripted import Scripted, observe_state
 
-    env = EnvConfig(str(what), "ideal")
+    env = EnvConfig(str(subject), "ideal")
     policy, env = Scripted(env.source.scripted), env.source.as_with_motors(env)
-    ran = run_episodes(policy, lambda: state_observed(env.make()), episodes, seed)
-    return _gathered(f"{policy.description} of {env.source.name}", env, ran)
+    episodes_run = run_episodes(policy, lambda: observe_state(env.make()), episodes, seed)
+    return _demands_from_episodes(f"{policy.description} of {env.source.name}", env, episodes_run)
 
 
-def recorded(time: Any, torque: Any, speed: Any, source: str = "a recording") -> Demand:
-    """A demand from arrays of one's own, to be delivered as it is.
+def demand_from_arrays(time: Any, torque: Any, speed: Any, source: str = "a recording") -> Demand:
+    """Return a demand from arrays, to be followed exactly.
 
     Args:
-        time: [s], shape (T,), T >= 2, increasing.
-        torque: at the joint [N*m], shape (T,).
-        speed: of the joint [rad/s], shape (T,).
-        source: where it is from.
+        time: time [s], shape (T,), T >= 2, increasing.
+        torque: torque at the joint [N*m], shape (T,).
+        speed: speed of the joint [rad/s], shape (T,).
+        source: description of the origin.
 
     Raises:
         ValueError: shapes differ, a value is not finite, or time does not increase.
     """
     arrays = {
-        name: np.asarray(given, float)
-        for name, given in (("time", time), ("torque", torque), ("speed", speed))
+        name: np.asarray(values, float)
+        for name, values in (("time", time), ("torque", torque), ("speed", speed))
     }
     for name, array in arrays.items():
         if array.ndim != 1 or len(array) < 2 or array.shape != arrays["time"].shape:
@@ -163,15 +166,15 @@ def recorded(time: Any, torque: Any, speed: Any, source: str = "a recording") ->
                 " speed"
             )
         if not np.isfinite(array).all():
-            where = int(np.flatnonzero(~np.isfinite(array))[0])
+            index = int(np.flatnonzero(~np.isfinite(array))[0])
             raise ValueError(
-                f"{name}[{where}] = {array[where]}: must be finite; leave out what was not measured"
+                f"{name}[{index}] = {array[index]}: must be finite; leave out what was not measured"
             )
     steps = np.diff(arrays["time"])
     if not (steps > 0.0).all():
-        where = int(np.flatnonzero(steps <= 0.0)[0]) + 1
+        index = int(np.flatnonzero(steps <= 0.0)[0]) + 1
         raise ValueError(
-            f"time[{where}] = {arrays['time'][where]:g} s: must be above the one before; sort the"
+            f"time[{index}] = {arrays['time'][index]:g} s: must be above the previous one; sort the"
             " samples"
         )
     acceleration = np.gradient(arrays["speed"], arrays["time"])
@@ -179,22 +182,23 @@ def recorded(time: Any, torque: Any, speed: Any, source: str = "a recording") ->
     return Demand(source, duration, arrays["torque"], arrays["speed"], acceleration, exact=True)
 
 
-def _gathered(source: str, env: Any, ran: Sequence[Any]) -> dict[str, Demand]:
-    """The demands on all motors, from episodes of one environment."""
+def _demands_from_episodes(source: str, env: Any, episodes: Sequence[Any]) -> dict[str, Demand]:
+    """Return the demands on all motors from episodes of one environment."""
     import mujoco
 
     from codrl_mj.engine.reading import motors
     from codrl_mj.engine.specs import ON_JOINT
 
-    swing, ends = None, [env.source.at_goal(one) for one in ran]
-    if all(end is not None for end in ends):
+    swing, at_goal = None, [env.source.at_goal(episode) for episode in episodes]
+    if all(mask is not None for mask in at_goal):
         source = (
-            f"{source}, {sum(bool(end[-1]) for end in ends if end is not None)} of {len(ran)}"
-            " episodes at the goal"
+            f"{source}, {sum(bool(mask[-1]) for mask in at_goal if mask is not None)} of"
+            f" {len(episodes)} episodes at the goal"
         )
-    with contextlib.closing(env.make()) as made:
-        core: Any = made.unwrapped
+    with contextlib.closing(env.make()) as opened_env:
+        core: Any = opened_env.unwrapped
         if env.task == "pendulum":
+            # A thin uniform rod about its end: inertia m*l^2/3, center of mass at l/2.
             length = core.l
             inertia, gravity = (
                 core.m * length**2 / 3.0 + env.joint.armature,
@@ -208,32 +212,41 @@ def _gathered(source: str, env: Any, ran: Sequence[Any]) -> dict[str, Demand]:
                 env.joint.friction,
             )
         model = core.model
-        driven = list(motors(model)) or [
-            model.actuator(name).id for name in made.get_wrapper_attr("recorder").motor_names
+        actuator_ids = list(motors(model)) or [
+            model.actuator(name).id for name in opened_env.get_wrapper_attr("recorder").motor_names
         ]
     speeds, forces = (
-        [np.column_stack([one.trace[name]]) for one in ran] for name in ("speed", "actual_force")
+        [np.column_stack([episode.trace[name]]) for episode in episodes]
+        for name in ("speed", "actual_force")
     )
-    found = {}
-    for number, index in enumerate(driven):
-        name = ran[0].motors[number] if ran[0].motors else ""
-        before = [
-            np.append(one.first_speeds[number], each[:, number])
-            for one, each in zip(ran, speeds, strict=True)
+    demands = {}
+    for motor_index, actuator_id in enumerate(actuator_ids):
+        name = episodes[0].motors[motor_index] if episodes[0].motors else ""
+        start_speeds = [
+            np.append(episode.first_speeds[motor_index], episode_speeds[:, motor_index])
+            for episode, episode_speeds in zip(episodes, speeds, strict=True)
         ]
-        kind, joint = mujoco.mjtTrn(model.actuator_trntype[index]), model.actuator_trnid[index, 0]
+        kind, joint = (
+            mujoco.mjtTrn(model.actuator_trntype[actuator_id]),
+            model.actuator_trnid[actuator_id, 0],
+        )
         sliding = kind in ON_JOINT and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-        gear = abs(float(model.actuator_gear[model.actuator_outadr[index], 0])) or 1.0
-        found[name] = Demand(
+        gear = abs(float(model.actuator_gear[model.actuator_outadr[actuator_id], 0])) or 1.0
+        demands[name] = Demand(
             source=f"{source}: {name}" if name else source,
-            duration=np.full(sum(len(one) - 1 for one in before), ran[0].timestep),
-            torque=gear * np.concatenate([force[:, number] for force in forces]),
-            speed=np.concatenate([one[:-1] for one in before]) / gear,
-            acceleration=np.concatenate([np.diff(one) / ran[0].timestep for one in before]) / gear,
-            episodes=len(ran),
+            duration=np.full(
+                sum(len(episode) - 1 for episode in start_speeds), episodes[0].timestep
+            ),
+            torque=gear * np.concatenate([force[:, motor_index] for force in forces]),
+            speed=np.concatenate([episode[:-1] for episode in start_speeds]) / gear,
+            acceleration=np.concatenate(
+                [np.diff(episode) / episodes[0].timestep for episode in start_speeds]
+            )
+            / gear,
+            episodes=len(episodes),
             linear=bool(sliding),
-            servo=bool(np.any(model.actuator_biasprm[index, 1:3])),
+            servo=bool(np.any(model.actuator_biasprm[actuator_id, 1:3])),
             swing=swing,
             model_gear=gear,
         )
-    return found
+    return demands

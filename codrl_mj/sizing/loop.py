@@ -1,11 +1,12 @@
-"""The current loop of a drive or an `DCMotorActuator`: gains, margins, bandwidth, and steps by their own equations.
+"""Current loop of a `Drive` or a `DCMotorActuator`: gains, margins, bandwidth and step responses.
 
-As the sampled current sees it: the winding under a zero-order hold is (1 - e)/R/(z - e) with e =
-exp(-R*T/L), the PI controller ((kp + ki*T)*z - kp)/(z - 1), the delay of a sample 1/z. Source:
-Franklin, Powell, Workman, *Digital Control of Dynamic Systems*, ch. 4; `codrl_mj.actuators.sampled`
-has the design. An `DCMotorActuator`'s winding is stepped by Euler's rule, T/L/(z - 1 + R*T/L), under the
-PID controller of `codrl_mj.actuators.current_loop`; its sample rate is that of the mechanical
-steps, times its substeps, so that its functions take a mechanical step [s].
+Transfer functions refer to the sampled current. For a `Drive`, the winding with a zero-order hold
+is (1 - e)/R/(z - e) with e = exp(-R*T/L), the PI controller is ((kp + ki*T)*z - kp)/(z - 1), and
+the delay of a sample is 1/z. Source: Franklin, Powell, Workman, *Digital Control of Dynamic
+Systems*, ch. 4; the design is in `codrl_mj.actuators.sampled`. A `DCMotorActuator` integrates its
+winding by Euler's rule, T/L/(z - 1 + R*T/L), with the PID controller of
+`codrl_mj.actuators.current_loop`. Its sample rate is the number of substeps per mechanical step, so
+functions take that step [s].
 """
 
 import dataclasses
@@ -19,21 +20,22 @@ from codrl_mj.actuators.sampled import designed_gains
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 from codrl_mj.fields import check_memory
 
-Looped = Drive | DCMotorActuator
-_SAMPLE_SIZE = (
-    500  # memory [bytes] of a sample in the responses to a step, with each kind of anti-windup
-)
+CurrentLoopActuator = Drive | DCMotorActuator
+# Memory [bytes] of a sample in the step responses, over all kinds of anti-windup.
+_SAMPLE_SIZE = 500
 RATES = (10e3, 20e3, 40e3)
-"""Sample rates [Hz] that drives commonly have."""
+"""Common sample rates of drives [Hz]."""
 
 
-def is_closed(one: Looped) -> bool:
-    """Whether there is a loop: a gain on the error."""
-    return isinstance(one, Drive) or any((one.controller.kp, one.controller.ki, one.controller.kd))
+def is_closed(actuator: CurrentLoopActuator) -> bool:
+    """Return True if the loop is closed, by a nonzero gain on the error."""
+    return isinstance(actuator, Drive) or any(
+        (actuator.controller.kp, actuator.controller.ki, actuator.controller.kd)
+    )
 
 
 def gains(drive: Drive) -> tuple[float, float]:
-    """Proportional gain [V/A] and integral gain [V/(A*s)] of a drive's loop, designed or given."""
+    """Return a drive's proportional [V/A] and integral gain [V/(A*s)], designed or explicit."""
     loop = drive.controller
     if loop.kp != 0.0 or loop.ki != 0.0:
         return loop.kp, loop.ki
@@ -42,8 +44,9 @@ def gains(drive: Drive) -> tuple[float, float]:
     return kp, ki * loop.sample_rate
 
 
-def sampled_too_seldom(drive: Drive) -> str:
-    """What to say of less than a sample in three L/R, within which 95 % of a current's change happen; else empty."""
+def undersampling_warning(drive: Drive) -> str:
+    """Return a warning if a sample is longer than three L/R of the winding; otherwise empty."""
+    # Within three time constants a current makes 95 % of its change.
     rate, constant = drive.controller.sample_rate, drive.motor.electrical_time_constant
     text = (
         f"sample_rate = {rate:g} Hz: a sample lasts {1.0 / rate / constant:,.1f} times the"
@@ -54,46 +57,56 @@ def sampled_too_seldom(drive: Drive) -> str:
 
 
 class _Sampled(NamedTuple):
-    """A current loop in z, whosever it is."""
+    """Current loop in z."""
 
-    rate: float  # samples a second [Hz]
+    rate: float  # sample rate [Hz]
     gains: tuple[float, float]  # proportional [V/A], integral [V/(A*s)]
-    over: np.ndarray  # numerator from error to sampled current
-    under: np.ndarray  # its denominator
+    numerator: np.ndarray  # from error to sampled current
+    denominator: np.ndarray
     forward: np.ndarray  # numerator from reference to sampled current
-    at_once: float  # voltage for one ampere of a step, in its first sample [V/A]
-    constant: float  # time constant of the designed loop, or of the winding under given gains [s]
-    most: float = math.inf  # largest current that is asked for [A]
-    delayed: bool = False  # whether the voltage comes a sample late
+    initial_gain: float  # voltage per ampere in the first sample of a step [V/A]
+    constant: float  # time constant of the designed loop, or of the winding with explicit gains [s]
+    max_current: float = math.inf  # largest reference current [A]
+    delayed: bool = False  # True if the voltage is applied one sample late
 
 
-def _sampled(one: Looped, timestep: float | None) -> _Sampled:
-    """The loop of a drive, or of an `DCMotorActuator` at a mechanical step [s]."""
-    resistance, inductance = one.winding
+def _sampled(actuator: CurrentLoopActuator, timestep: float | None) -> _Sampled:
+    """Return the loop of a drive, or of a `DCMotorActuator` with a mechanical step [s]."""
+    resistance, inductance = actuator.winding
     constant = inductance / resistance
-    if isinstance(one, Drive):
-        (kp, ki), rate = gains(one), one.controller.sample_rate
+    if isinstance(actuator, Drive):
+        (kp, ki), rate = gains(actuator), actuator.controller.sample_rate
         time = 1.0 / rate
-        if one.controller.kp == 0.0 and one.controller.ki == 0.0:
+        if actuator.controller.kp == 0.0 and actuator.controller.ki == 0.0:
             constant = 1.0 / (
-                2.0 * math.pi * (one.controller.bandwidth or DEFAULT_BANDWIDTH * rate)
+                2.0 * math.pi * (actuator.controller.bandwidth or DEFAULT_BANDWIDTH * rate)
             )
         decay = math.exp(-resistance * time / inductance)
-        effect = -math.expm1(-resistance * time / inductance) / resistance  # [A/V], of a sample
-        over = np.array([effect * (kp + ki * time), -effect * kp])
-        late = [1.0, 0.0] if one.controller.delayed else [1.0]
-        under = np.polymul(np.polymul([1.0, -decay], [1.0, -1.0]), late)
-        most, delayed = one.controller.max_current, one.controller.delayed
-        return _Sampled(rate, (kp, ki), over, under, over, kp + ki / rate, constant, most, delayed)
+        input_gain = -math.expm1(-resistance * time / inductance) / resistance  # [A/V], of a sample
+        numerator = np.array([input_gain * (kp + ki * time), -input_gain * kp])
+        delay = [1.0, 0.0] if actuator.controller.delayed else [1.0]
+        denominator = np.polymul(np.polymul([1.0, -decay], [1.0, -1.0]), delay)
+        max_current, delayed = actuator.controller.max_current, actuator.controller.delayed
+        return _Sampled(
+            rate,
+            (kp, ki),
+            numerator,
+            denominator,
+            numerator,
+            kp + ki / rate,
+            constant,
+            max_current,
+            delayed,
+        )
     if timestep is None:
         raise ValueError(
-            "timestep = None: must be the mechanical step [s] of an Actuator, whose loop is closed"
-            " in it"
+            "timestep = None: must be the mechanical step [s] of a DCMotorActuator, whose loop"
+            " is sampled within it"
         )
-    rate, loop = one.controller.substeps / timestep, one.controller
+    rate, loop = actuator.controller.substeps / timestep, actuator.controller
     time = 1.0 / rate
-    pid, below = np.array([loop.kp]), np.array([1.0])  # from error [A] to voltage [V]
-    for gain, up, down in (
+    pid, pid_denominator = np.array([loop.kp]), np.array([1.0])  # from error [A] to voltage [V]
+    for gain, term_numerator, term_denominator in (
         (loop.ki, [time, 0.0], [1.0 + loop.integral_leak * time, -1.0]),
         (
             loop.kd,
@@ -102,44 +115,48 @@ def _sampled(one: Looped, timestep: float | None) -> _Sampled:
         ),
     ):
         if gain:
-            pid, below = (
-                np.polyadd(np.polymul(pid, down), gain * np.polymul(up, below)),
-                np.polymul(below, down),
+            pid, pid_denominator = (
+                np.polyadd(
+                    np.polymul(pid, term_denominator),
+                    gain * np.polymul(term_numerator, pid_denominator),
+                ),
+                np.polymul(pid_denominator, term_denominator),
             )
-    over = pid * time / inductance
-    under = np.polymul(below, [1.0, resistance * time / inductance - 1.0])
-    forward = np.polyadd(
-        over, loop.kff * time / inductance * below
-    )  # feed-forward goes past the error
-    at_once = pid[0] / below[0] + loop.kff
-    return _Sampled(rate, (loop.kp, loop.ki), over, under, forward, at_once, constant)
+    numerator = pid * time / inductance
+    denominator = np.polymul(pid_denominator, [1.0, resistance * time / inductance - 1.0])
+    # The feed-forward bypasses the error, so it appears only in the numerator from the reference.
+    forward = np.polyadd(numerator, loop.kff * time / inductance * pid_denominator)
+    initial_gain = pid[0] / pid_denominator[0] + loop.kff
+    return _Sampled(
+        rate, (loop.kp, loop.ki), numerator, denominator, forward, initial_gain, constant
+    )
 
 
-def open_loop(one: Looped, timestep: float | None = None) -> Any:
-    """The loop from error to sampled current, a `control.TransferFunction` in z."""
+def open_loop(actuator: CurrentLoopActuator, timestep: float | None = None) -> Any:
+    """Return the transfer function from error to sampled current, in z."""
     import control
 
-    loop = _sampled(one, timestep)
-    return control.TransferFunction(loop.over, loop.under, 1.0 / loop.rate)
+    loop = _sampled(actuator, timestep)
+    return control.TransferFunction(loop.numerator, loop.denominator, 1.0 / loop.rate)
 
 
-def closed_loop(one: Looped, timestep: float | None = None) -> Any:
-    """The loop from reference to sampled current, a `control.TransferFunction` in z."""
+def closed_loop(actuator: CurrentLoopActuator, timestep: float | None = None) -> Any:
+    """Return the transfer function from reference to sampled current, in z."""
     import control
 
-    loop = _sampled(one, timestep)
+    loop = _sampled(actuator, timestep)
     return control.TransferFunction(
-        loop.forward, np.polyadd(loop.under, loop.over), 1.0 / loop.rate
+        loop.forward, np.polyadd(loop.denominator, loop.numerator), 1.0 / loop.rate
     )
 
 
 class Response(NamedTuple):
-    """A drive's currents over time; entry 0 is the start."""
+    """Response of a current loop over time; entry 0 is the start."""
 
     time: np.ndarray
-    """[s]"""
+    """Time [s]."""
     reference: np.ndarray
-    """Current asked for [A], from each time on."""
+    """Reference current [A], from each time on."""
     current: np.ndarray
     """Sampled current [A]."""
     voltage: np.ndarray
@@ -147,23 +164,25 @@ class Response(NamedTuple):
 
     @property
     def overshoot(self) -> float:
-        """How far the current goes beyond the last reference, as a share of it."""
+        """Overshoot of the current over the last reference, as a share of it."""
         return max(float(self.current.max() / self.reference[-1]) - 1.0, 0.0)
 
     @property
     def _last(self) -> int:
-        """From where on the last reference is asked for."""
+        """Index from which the last reference applies."""
         return int(np.flatnonzero(np.diff(self.reference, prepend=math.nan) != 0.0)[-1])
 
     @property
     def undershoot(self) -> float:
-        """How far the current falls below the last reference once that is asked for, as a share of it."""
+        """Largest deficit of the current below the last reference, as a share of it."""
         return max(1.0 - float(self.current[self._last :].min()) / float(self.reference[-1]), 0.0)
 
     def settling_time(self, band: float = 0.02) -> float:
-        """When the current stays within a share of the last reference [s after that came]; NaN: not within sight."""
-        wrong = np.flatnonzero(np.abs(self.current[self._last :] / self.reference[-1] - 1.0) > band)
-        settled = self._last + (int(wrong[-1]) + 1 if len(wrong) else 0)
+        """Return the time [s] until the current stays in the band after the last step, or NaN."""
+        outside = np.flatnonzero(
+            np.abs(self.current[self._last :] / self.reference[-1] - 1.0) > band
+        )
+        settled = self._last + (int(outside[-1]) + 1 if len(outside) else 0)
         return (
             float(self.time[settled] - self.time[self._last])
             if settled < len(self.time)
@@ -171,184 +190,197 @@ class Response(NamedTuple):
         )
 
 
-def respond(
-    one: Looped, references: Any, speed: float = 0.0, timestep: float | None = None
+def simulate_loop(
+    actuator: CurrentLoopActuator,
+    references: Any,
+    speed: float = 0.0,
+    timestep: float | None = None,
 ) -> Response:
-    """Step a loop one sample at a time, through its own `advance`, from where it has held a current of 0 at its speed.
+    """Simulate a loop sample by sample with its `advance`, starting from a settled current of 0.
 
     Args:
-        one: a drive; or an `DCMotorActuator`, whose sensor is right here, and whose speed must be 0.
-        references: current asked for in each sample [A], shape (n,).
-        speed: of the rotor [rad/s], held.
-        timestep: of an `DCMotorActuator`: see the module.
+        actuator: a drive; or a `DCMotorActuator`, with an exact sensor and a speed of 0.
+        references: reference current of each sample [A], shape (n,).
+        speed: constant speed of the rotor [rad/s].
+        timestep: mechanical step of a `DCMotorActuator` [s]; see the module.
     """
-    time = 1.0 / _sampled(one, timestep).rate
-    kind: Any = one.State
-    state = kind(*[0.0] * len(kind._fields))
-    if isinstance(one, Drive):
-        back_emf = one.motor.back_emf_constant * speed
-        integral = 0.0 if one.controller.bemf_compensation else back_emf
+    time = 1.0 / _sampled(actuator, timestep).rate
+    state_type: Any = actuator.State
+    state = state_type(*[0.0] * len(state_type._fields))
+    if isinstance(actuator, Drive):
+        back_emf = actuator.motor.back_emf_constant * speed
+        # At constant speed and zero current the integrator holds the back-EMF, unless it is
+        # compensated.
+        integral = 0.0 if actuator.controller.bemf_compensation else back_emf
         state = state._replace(integral=integral, pending=back_emf, speed=speed)
     else:
-        right = {"substeps": 1, "current_bias": 0.0, "current_noise": 0.0}
-        one = one.replaced({f"controller.{name}": value for name, value in right.items()})
-    family: Any = type(one)
-    parameters, rows = parameters_type(family)(*one.numbers), []
+        exact_sensor = {"substeps": 1, "current_bias": 0.0, "current_noise": 0.0}
+        actuator = actuator.replaced(
+            {f"controller.{name}": value for name, value in exact_sensor.items()}
+        )
+    family: Any = type(actuator)
+    parameters, rows = parameters_type(family)(*actuator.parameter_values), []
     for reference in references:
-        before = state.current
-        torque = one.motor.torque_constant * float(reference)
-        state, _, signals = one.advance(
+        sampled_current = state.current
+        torque = actuator.motor.torque_constant * float(reference)
+        state, _, signals = actuator.advance(
             parameters, time, state, Inputs(torque, 0.0, speed, 0.0, 0.0)
         )
-        rows.append((signals.reference_current, before, signals.voltage))
+        rows.append((signals.reference_current, sampled_current, signals.voltage))
     return Response(time * np.arange(len(rows)), *np.array(rows).T)
 
 
-def small_step(one: Looped, timestep: float | None = None) -> Response:
-    """The step from rest to a current that does not saturate.
+def small_step_response(actuator: CurrentLoopActuator, timestep: float | None = None) -> Response:
+    """Return the response from rest to a current step that does not saturate.
 
-    It is a tenth of V/R, or what half the voltage makes at once, or `max_current`, whichever is
-    smallest; 1 A where the voltage has no limit. It lasts 20 time constants of the designed loop,
-    or of the winding under given gains, and 100 to 20000 samples.
+    The step is the smallest of V/R/10, the current whose first sample takes half the voltage, and
+    `max_current`; it is 1 A if the voltage is unlimited. It lasts 20 time constants of the designed
+    loop, or of the winding with explicit gains, and 100 to 20000 samples.
     """
-    loop, limit = _sampled(one, timestep), one.voltage_limit
-    amplitude = min(0.1 * limit / one.winding[0], 0.5 * limit / loop.at_once, loop.most)
+    loop, limit = _sampled(actuator, timestep), actuator.voltage_limit
+    amplitude = min(
+        0.1 * limit / actuator.winding[0], 0.5 * limit / loop.initial_gain, loop.max_current
+    )
     samples = min(max(math.ceil(20.0 * loop.constant * loop.rate), 100), 20_000)
-    return respond(
-        one, np.full(samples, amplitude if math.isfinite(amplitude) else 1.0), timestep=timestep
+    return simulate_loop(
+        actuator,
+        np.full(samples, amplitude if math.isfinite(amplitude) else 1.0),
+        timestep=timestep,
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class LoopDesign:
-    """A current loop and what follows from it; NaN where there is none below half the sample rate."""
+    """Figures of a current loop; NaN for a crossing above half the sample rate."""
 
     sample_rate: float
-    """[Hz]"""
+    """Sample rate [Hz]."""
     delayed: bool
-    """Whether the voltage comes a sample late."""
+    """True if the voltage is applied one sample late."""
     kp: float
-    """[V/A]"""
+    """Proportional gain [V/A]."""
     ki: float
-    """[V/(A*s)]"""
+    """Integral gain [V/(A*s)]."""
     gain_margin: float
     """Factor on the gain at which the loop oscillates."""
     phase_margin: float
-    """Phase [deg] that is left at the crossover."""
+    """Phase margin [deg], at the crossover."""
     phase_crossover: float
-    """Where the open loop's phase is -180 degrees [Hz]: the gain margin is read there."""
+    """Frequency at which the open loop's phase is -180 degrees [Hz]; defines the gain margin."""
     crossover: float
-    """Where the open loop's gain is 1 [Hz]: the phase margin is read there."""
+    """Frequency at which the open loop's gain is 1 [Hz]; defines the phase margin."""
     bandwidth: float
-    """Where the closed loop's gain falls to 1/sqrt(2) [Hz]."""
+    """Frequency at which the closed loop's gain falls to 1/sqrt(2) [Hz]."""
     settling_time: float
-    """Of a small step, to 2 % [s]."""
+    """Settling time of a small step, to 2 % [s]."""
     overshoot: float
-    """Of a small step, as a share of it."""
+    """Overshoot of a small step, as a share of it."""
 
 
-def design(one: Looped, timestep: float | None = None) -> LoopDesign:
-    """Judge a current loop: margins of its transfer function, a step of its own.
+def design(actuator: CurrentLoopActuator, timestep: float | None = None) -> LoopDesign:
+    """Analyze a current loop: margins of its transfer function and a simulated step.
 
     Raises:
         ValueError: the loop is unstable; the message has the spectral radius and a remedy.
     """
-    loop = _sampled(one, timestep)
-    one.check(1.0 / loop.rate if timestep is None else timestep)
-    opened, closed, step = (
-        open_loop(one, timestep),
-        closed_loop(one, timestep),
-        small_step(one, timestep),
+    loop = _sampled(actuator, timestep)
+    actuator.check(1.0 / loop.rate if timestep is None else timestep)
+    open_transfer, closed_transfer, response = (
+        open_loop(actuator, timestep),
+        closed_loop(actuator, timestep),
+        small_step_response(actuator, timestep),
     )
-    # margins are searched for on the unit circle, which slow loops and the pole at z = 1 leave
-    # exact; python-control's, by the roots of polynomials, are not. At half the sample rate, z =
-    # -1, the loop is real: without a crossing before it the gain margin is read there
-    turned = _first_below(lambda z: -opened(z).imag, loop.rate)
-    turned = 0.5 * loop.rate if math.isnan(turned) else turned
-    crossover = _first_below(lambda z: abs(opened(z)) - 1.0, loop.rate)
-    at_crossover = opened(_point(crossover, loop.rate)) if crossover > 0.0 else math.nan
+    # The margins are searched on the unit circle, which is exact also for slow loops and the pole
+    # at z = 1. python-control uses roots of polynomials, which are not. At half the sample rate, z
+    # = -1, the loop is real: without an earlier crossing, the gain margin is defined there.
+    phase_crossover_ = _first_below(lambda z: -open_transfer(z).imag, loop.rate)
+    phase_crossover_ = 0.5 * loop.rate if math.isnan(phase_crossover_) else phase_crossover_
+    crossover = _first_below(lambda z: abs(open_transfer(z)) - 1.0, loop.rate)
+    at_crossover = open_transfer(_point(crossover, loop.rate)) if crossover > 0.0 else math.nan
     return LoopDesign(
         loop.rate,
         loop.delayed,
         *loop.gains,
-        gain_margin=float(1.0 / abs(opened(_point(turned, loop.rate)))),
+        gain_margin=float(1.0 / abs(open_transfer(_point(phase_crossover_, loop.rate)))),
         phase_margin=180.0 + math.degrees(np.angle(at_crossover)),
-        phase_crossover=turned,
+        phase_crossover=phase_crossover_,
         crossover=crossover,
-        bandwidth=_first_below(lambda z: abs(closed(z)) - math.sqrt(0.5), loop.rate),
-        settling_time=step.settling_time(),
-        overshoot=step.overshoot,
+        bandwidth=_first_below(lambda z: abs(closed_transfer(z)) - math.sqrt(0.5), loop.rate),
+        settling_time=response.settling_time(),
+        overshoot=response.overshoot,
     )
 
 
 def designs(drive: Drive) -> dict[tuple[float, bool], LoopDesign | str]:
-    """`design` at its own rate and at `RATES`, without and with the delay of a sample; a text says why there is none.
+    """Return (rate, delayed) -> `design` at the drive's rate and at `RATES`, or an error as text.
 
-    Its bandwidth is kept, or its gains where they are given.
+    The bandwidth is kept, or the gains if they are explicit.
     """
-    found: dict[tuple[float, bool], LoopDesign | str] = {}
+    designs_by_rate: dict[tuple[float, bool], LoopDesign | str] = {}
     for rate in sorted({drive.controller.sample_rate, *RATES}):
         for delayed in (False, True):
             try:
-                found[rate, delayed] = design(
+                designs_by_rate[rate, delayed] = design(
                     drive.replaced({"controller.sample_rate": rate, "controller.delayed": delayed})
                 )
             except ValueError as error:
-                found[rate, delayed] = str(error)
-    return found
+                designs_by_rate[rate, delayed] = str(error)
+    return designs_by_rate
 
 
 def _point(frequency: Any, rate: float) -> Any:
-    """On the unit circle: the z of a frequency [Hz]."""
+    """Return the point z on the unit circle for a frequency [Hz]."""
     return np.exp(2j * math.pi * frequency / rate)
 
 
 def _first_below(function: Any, rate: float) -> float:
-    """The first frequency [Hz] at which a function of z falls below 0; NaN where it never does, or always is."""
+    """Return the first frequency [Hz] at which a function of z becomes negative, or NaN."""
     from scipy.optimize import brentq
 
     frequencies = np.geomspace(1e-7, 0.49999, 4000) * rate
-    below = np.flatnonzero(function(_point(frequencies, rate)) < 0.0)
-    if not len(below) or below[0] == 0:
+    negative = np.flatnonzero(function(_point(frequencies, rate)) < 0.0)
+    if not len(negative) or negative[0] == 0:
         return math.nan
-    around = frequencies[below[0] - 1], frequencies[below[0]]
-    return float(brentq(lambda frequency: float(function(_point(frequency, rate))), *around))
+    bracket = frequencies[negative[0] - 1], frequencies[negative[0]]
+    return float(brentq(lambda frequency: float(function(_point(frequency, rate))), *bracket))
 
 
-# -- out of saturation ---------------------------------------------------------------------------------------------
+# -- out of saturation -----------------------------------------------------------------------------
 
 ANTI_WINDUPS = ("back_calculation", "clamping", "none")
-"""The kinds, as `SampledLoop.anti_windup` names them."""
+"""Kinds of anti-windup, by their names in `SampledLoop.anti_windup`."""
 _UNREACHABLE = 0.02
-"""For how long more is asked for than can be made [s]."""
+"""Duration of the unreachable reference [s]."""
 _AFTER = 0.1
-"""How long the recovery is looked at [s]."""
+"""Duration of the recovery [s]."""
 
 
-class Steps(NamedTuple):
+class StepResponses(NamedTuple):
     """Step responses of a drive."""
 
     small: Response
-    """To a current that does not saturate, at standstill."""
+    """Response to a current that does not saturate, at standstill."""
     speed: float
-    """Of the rotor in the saturated step [rad/s]: half V/kE, or what makes an unreachable current of `max_current`."""
+    """Rotor speed in the saturated step [rad/s]: V/(2 kE), or the speed that makes `max_current`
+    unreachable.
+    """
     unreachable: float
-    """Current asked for in vain, for 20 ms [A]."""
+    """Reference current that cannot be reached, for 20 ms [A]."""
     reachable: float
-    """Current asked for then [A]."""
+    """Reference current after that [A]."""
     recoveries: dict[str, Response]
-    """By kind of anti-windup: what it makes of a current that cannot be reached, and of one that can."""
+    """Kind of anti-windup -> response to the unreachable and then the reachable current."""
 
 
-def step(drive: Drive) -> Steps:
-    """Step a drive's current: small, and out of saturation with each kind of anti-windup.
+def step_responses(drive: Drive) -> StepResponses:
+    """Return a drive's small step response, and its recovery from saturation with each anti-windup.
 
-    In saturation 1.8 times of what the voltage can make at `Steps.speed` is asked for, then 0.4
-    times of it.
+    The unreachable reference is 1.8 times the largest current at `StepResponses.speed`, and the
+    reachable one 0.4 times.
 
     Raises:
-        ValueError: the loop is unstable, the message has the spectral radius and a remedy; or its
-            samples are too few.
+        ValueError: the loop is unstable (the message has the spectral radius and a remedy), or
+            the sample rate is below 1 kHz.
     """
     loop = drive.controller
     if loop.sample_rate < 1e3:
@@ -357,8 +389,8 @@ def step(drive: Drive) -> Steps:
             " raise it"
         )
     samples = (_UNREACHABLE + _AFTER) * loop.sample_rate
-    what = f"SampledLoop.sample_rate = {loop.sample_rate:g}: {samples:,.0f} samples of a step"
-    check_memory(_SAMPLE_SIZE * samples, what, "lower it")
+    label = f"SampledLoop.sample_rate = {loop.sample_rate:g}: {samples:,.0f} samples of a step"
+    check_memory(_SAMPLE_SIZE * samples, label, "lower it")
     drive.check(1.0 / loop.sample_rate)
     motor, voltage = drive.motor, drive.voltage_limit
     speed, unreachable = 0.0, min(1.8 * voltage / motor.resistance, loop.max_current)
@@ -371,7 +403,7 @@ def step(drive: Drive) -> Steps:
         [np.full(round(time * loop.sample_rate), current) for time, current in spans]
     )
     recoveries = {
-        kind: respond(drive.replaced({"controller.anti_windup": kind}), references, speed)
+        kind: simulate_loop(drive.replaced({"controller.anti_windup": kind}), references, speed)
         for kind in ANTI_WINDUPS
     }
-    return Steps(small_step(drive), speed, unreachable, reachable, recoveries)
+    return StepResponses(small_step_response(drive), speed, unreachable, reachable, recoveries)

@@ -1,4 +1,4 @@
-"""The energy that a motor can pump into a swinging pendulum: what a swing-up needs before anything else."""
+"""Energy that a motor can pump into a swinging pendulum, which a swing-up requires."""
 
 import dataclasses
 import math
@@ -13,41 +13,43 @@ from codrl_mj.sizing.abilities import highest_current
 _ANGLES = np.linspace(-np.pi, np.pi, 1001)
 _STEP = _ANGLES[1] - _ANGLES[0]
 _LEVELS = np.linspace(0.02, 1.0, 50)
-"""Energies of swings over that of the top."""
-_MOST_VOLTS = 1e4
+"""Energies of swings [energy at the top]."""
+_MAX_VOLTAGE = 1e4
 
 
 class Swing(NamedTuple):
-    """A pendulum to be swung up; its angle theta is 0 hanging."""
+    """Pendulum to be swung up; its angle theta is 0 when it hangs."""
 
     inertia: float
-    """About its hinge [kg*m^2]."""
+    """Inertia about its hinge [kg*m^2]."""
     gravity: float
-    """Gravity's largest torque G, m*g times the distance of hinge and centre of mass [N*m]."""
+    """Largest torque G of gravity: m*g times the distance from hinge to center of mass [N*m]."""
     largest: float
-    """Largest torque that may be asked for [N*m]."""
+    """Largest torque command [N*m]."""
     damping: float = 0.0
-    """Of the hinge [N*m*s/rad]."""
+    """Damping of the hinge [N*m*s/rad]."""
     friction: float = 0.0
     """Coulomb friction of the hinge [N*m]."""
 
     def potential(self, angle: Any) -> Any:
-        """Energy [J] at rest."""
+        """Return the potential energy [J]."""
         return self.gravity * (1.0 - np.cos(angle))
 
     def speed(self, kinetic: Any, drive: Drive) -> Any:
-        """Speed [rad/s] at a kinetic energy [J] of pendulum and rotor; 0 where that is negative."""
+        """Return the speed [rad/s] at a kinetic energy [J] of pendulum and rotor; 0 if negative."""
         return np.sqrt(2.0 * np.maximum(kinetic, 0.0) / (self.inertia + drive.additions.armature))
 
     def push(self, speed: Any, drive: Drive) -> Any:
-        """The most torque [N*m] in the direction of motion, friction taken off.
+        """Return the largest net torque [N*m] in the direction of motion.
 
-        min(tau_max, N eta kT min((V - N kE omega)/R, i_max)): negative beyond the no-load speed,
-        where nothing but a higher voltage keeps the current from braking. R: with the supply's.
+        It is min(tau_max, N eta kT min((V - N kE omega)/R, i_max)) minus friction, with R of
+        winding and supply. It is negative beyond the no-load speed, where the current brakes.
         """
         motor, ratio, added = drive.motor, 1.0 / drive.arm_radius, drive.additions
         back_emf = ratio * motor.back_emf_constant * np.asarray(speed)
-        current = highest_current(motor.resistance, drive.voltage_limit, drive.sag, back_emf)
+        current = highest_current(
+            motor.resistance, drive.voltage_limit, drive.supply_resistance, back_emf
+        )
         current = np.minimum(current, drive.controller.max_current)
         torque = np.minimum(
             self.largest, ratio * motor.torque_constant * motor.gear_efficiency * current
@@ -55,12 +57,12 @@ class Swing(NamedTuple):
         return torque - self.friction - added.friction - (self.damping + added.damping) * speed
 
 
-def least_pumped(swing: Swing, drive: Drive) -> float:
-    """The energy [J] that full force brings in during a swing, where that is least on the way up: an estimate.
+def min_pumped_energy(swing: Swing, drive: Drive) -> float:
+    """Return an estimate of the smallest energy [J] that full force adds in a swing.
 
-    min over E of the integral of push(omega) over theta, with omega = sqrt(2 (E - potential(theta))
-    / I): the energy of the swing is taken as constant. Infinite where the torque lifts the pendulum
-    without a swing.
+    It is the minimum over E of the integral of push(omega) over theta, with omega = sqrt(2 (E -
+    potential(theta)) / I): the energy is treated as constant during a swing. Infinite if the torque
+    lifts the pendulum without a swing.
     """
     if swing.push(0.0, drive) >= swing.gravity:
         return math.inf
@@ -69,48 +71,59 @@ def least_pumped(swing: Swing, drive: Drive) -> float:
     return float(net.sum(axis=1).min() * _STEP)
 
 
-def least_gain(swing: Swing, drive: Drive) -> float:
-    """The energy [J] that a pendulum gains from rest to rest in a swing, where that is least: the most that there is.
+def min_energy_gain(swing: Swing, drive: Drive) -> float:
+    """Return the smallest gain of energy [J] from rest to rest in a swing, for the best controller.
 
-    dE/dtheta = push(omega(E - potential(theta))) from each turning point. Whatever else a
-    controller does, E grows less everywhere, and so ends lower: where this is not positive, no
-    controller passes that amplitude. That leaves out inductance, which only delays, and the hold of
-    the speed over a step. A swing that goes over the top, or comes to rest where the torque at
-    standstill lifts it on, is through: infinite.
+    dE/dtheta = push(omega(E - potential(theta))) is integrated from each turning point. Any other
+    controller adds less energy at every angle, so if this gain is not positive at some amplitude,
+    no controller exceeds that amplitude. Two effects are ignored: inductance, which only delays the
+    torque, and the speed's hold over a step. The gain is infinite if the swing goes over the top or
+    comes to rest where the standstill torque lifts the pendulum further.
     """
-    still = swing.push(0.0, drive)
-    if still >= swing.gravity:
+    standstill_torque = swing.push(0.0, drive)
+    if standstill_torque >= swing.gravity:
         return math.inf
     starts = np.arccos(1.0 - 2.0 * _LEVELS)
-    carried = np.pi - math.asin(
-        max(still, 0.0) / swing.gravity
-    )  # from there on the torque lifts without a swing
-    starts = starts[starts < carried]
+    # Beyond this angle the standstill torque exceeds gravity and lifts the pendulum without a
+    # swing.
+    lift_angle = np.pi - math.asin(max(standstill_torque, 0.0) / swing.gravity)
+    starts = starts[starts < lift_angle]
     energy, furthest, moving = swing.potential(starts), -starts, np.ones(len(starts), bool)
+    # All swings are integrated at once; each one starts when the angle passes its turning point.
     for angle in _ANGLES[:-1]:
-        begun = moving & (angle >= -starts)
-        gained = energy + _STEP * swing.push(
+        started = moving & (angle >= -starts)
+        new_energy = energy + _STEP * swing.push(
             swing.speed(energy - swing.potential(angle), drive), drive
         )
-        energy = np.where(begun, gained, energy)
-        moving &= ~begun | (energy > swing.potential(angle + _STEP))
-        furthest = np.where(begun & moving, angle + _STEP, furthest)
-    through = furthest >= carried
+        energy = np.where(started, new_energy, energy)
+        moving &= ~started | (energy > swing.potential(angle + _STEP))
+        furthest = np.where(started & moving, angle + _STEP, furthest)
+    completed = furthest >= lift_angle
     return float(
-        np.where(through, np.inf, swing.potential(furthest) - swing.potential(starts)).min()
+        np.where(completed, np.inf, swing.potential(furthest) - swing.potential(starts)).min()
     )
 
 
-def least_voltage(swing: Swing, drive: Drive, energy: Callable[[Swing, Drive], float]) -> float:
-    """The supply [V] from which `least_pumped` or `least_gain` is positive; infinite where no supply makes it so."""
+def min_supply_voltage(
+    swing: Swing, drive: Drive, energy: Callable[[Swing, Drive], float]
+) -> float:
+    """Return the lowest supply [V] with a positive energy; infinite if there is none.
+
+    `energy` is `min_pumped_energy` or `min_energy_gain`.
+    """
 
     def enough(voltage: float) -> bool:
-        return energy(swing, dataclasses.replace(drive, supply=Supply(voltage, drive.sag))) > 0.0
+        return (
+            energy(
+                swing, dataclasses.replace(drive, supply=Supply(voltage, drive.supply_resistance))
+            )
+            > 0.0
+        )
 
     low, high = 0.0, 1.0
     while not enough(high):
         low, high = high, 2.0 * high
-        if high > _MOST_VOLTS:
+        if high > _MAX_VOLTAGE:
             return math.inf
     while high - low > 1e-3 * high:
         middle = (low + high) / 2.0

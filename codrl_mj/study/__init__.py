@@ -1,15 +1,15 @@
-"""Studies: arms that are trained with many seeds, trials that test them, questions that are judged, and a page."""
+"""Studies: arms trained with many seeds, trials, judged questions and a result page."""
 
 from codrl_mj.study.inference import (
     Stratum,
-    detectable,
+    benjamini_hochberg,
+    detectable_difference,
     effect,
     equivalence_p,
-    false_discovery,
     holm,
     permutation_p,
 )
-from codrl_mj.study.pages import conclusions, markdown_table, read_csv, write_csv, write_page
+from codrl_mj.study.pages import markdown_table, read_conclusions, read_csv, write_csv, write_page
 from codrl_mj.study.parallel import Workers
 from codrl_mj.study.program import Program, main
 from codrl_mj.study.questions import Contrast, Question, Scores, Verdict, judge
@@ -34,12 +34,12 @@ __all__ = [
     "write_csv",
     "write_page",
     "markdown_table",
-    "conclusions",
+    "read_conclusions",
     "Stratum",
     "effect",
     "permutation_p",
     "equivalence_p",
     "holm",
-    "false_discovery",
-    "detectable",
+    "benjamini_hochberg",
+    "detectable_difference",
 ]

@@ -1,11 +1,11 @@
-"""What to do about an actuator on a task: its numbers on a bench, held against what the study measured.
+"""Recommendation for an actuator on a task, from a simulated bench test and the study's results.
 
-The bench gives one dose of everything that the study has an axis for. What ideal-trained policies
-lose at a dose is interpolated, policy by policy, between those that were tested, and losses are
-added up. What policies lose that were trained on random actuators, or through this one, is known
-where some were tested with no less of anything, or with no more. A `Measurement` needs no such
-assumptions: it trains and tests policies of its own, in whatever is an environment, and is judged
-by the same rule.
+The bench converts the actuator into a severity on each axis of the study. The loss of policies
+trained on ideal forces is interpolated, policy by policy, between the severities that the study
+tested, and the losses of all axes are added. For policies trained on random actuators or through
+the actuator, the study gives an upper bound if it tested severities at least as large on every
+axis, and a lower bound if it tested severities at most as large. A `Measurement` needs none of
+these assumptions: it trains and tests new policies, in any environment, and applies the same rule.
 """
 
 import dataclasses
@@ -18,254 +18,320 @@ import numpy as np
 from codrl_mj.actuators import IDEAL as IDEAL_ACTUATOR
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate
-from codrl_mj.study.bench import Delivery, commanded, delivered, doses, redesign
-from codrl_mj.study.doses import AXES, FLOORS, REAL, SECONDS, generic, ideal, posed
-from codrl_mj.study.evidence import Evidence, Loss, Outcome, total
+from codrl_mj.study.axes import AXES, FLOORS, REAL, SECONDS, generic, ideal, study_env
+from codrl_mj.study.bench import (
+    Delivery,
+    measure_on_task,
+    redesign_loop,
+    severities,
+    with_larger_command,
+)
+from codrl_mj.study.evidence import Evidence, Loss, Outcome, sum_outcomes
 from codrl_mj.study.questions import MARGIN, Scores
 from codrl_mj.study.trials import Arm, Collected, Grid, Trial
 from codrl_mj.training import TrainConfig, load_config
 
 IDEAL, COMMAND, LOOP = "train on ideal", "command more", "design the loop"
-RANDOMISE, THROUGH = "randomise", "train through it"
+RANDOMIZE, THROUGH = "randomise", "train through it"
 BUY, MEASURE = "buy another", "measure it"
 RANDOM = ("generic", "random")
-"""Arms of the two studies that were trained on random actuators, of two reaches."""
-OPTIONS = (IDEAL, COMMAND, LOOP, RANDOMISE, THROUGH)
-"""What can be done about an actuator, what takes least first; beside it one may buy another, or has to measure it."""
+"""Arms of the two studies trained on random actuators; the two differ in their ranges."""
+OPTIONS = (IDEAL, COMMAND, LOOP, RANDOMIZE, THROUGH)
+"""Options for an actuator, in order of effort. The other two verdicts are `BUY` and `MEASURE`."""
 
 
-class Prospect(NamedTuple):
-    """What is known of something that can be done."""
+class LossBounds(NamedTuple):
+    """Upper and lower bound on the loss of policies under one option."""
 
-    most: Outcome | None
-    """What policies lose at most; None if it is not known."""
-    least: Outcome | None
-    """What they lose at least; None if it is not known. The same as `most` where it was tested, or interpolated."""
+    upper: Outcome | None
+    """Largest possible loss; None if unknown."""
+    lower: Outcome | None
+    """Smallest possible loss; None if unknown. Identical to `upper` if tested or interpolated."""
+
+    def summary(self) -> dict[str, Any]:
+        """Return the bounds under the keys of the command line's JSON output."""
+        return {"most": self.upper, "least": self.lower}
 
     @property
     def bound(self) -> str:
-        """What to say before the number: `at least`, `at most` or nothing."""
-        if self.most is None:
+        """Prefix of the printed number: "at least ", "at most " or empty."""
+        if self.upper is None:
             return "at least "
-        return "" if self.most is self.least else "at most "
+        return "" if self.upper is self.lower else "at most "
 
 
-def decide(options: Mapping[str, Prospect]) -> str:
-    """What to do: the rule for what was predicted and for what was measured.
+def decide(options: Mapping[str, LossBounds]) -> str:
+    """Return the recommended option, for predicted and for measured losses alike.
 
-    The first of `OPTIONS` that loses nothing that matters; where none does, the first that is
-    within `MARGIN` of the best of those that surely lose less, by more than `MARGIN`, than policies
-    that never met the actuator; where there is none, `BUY` if every option surely loses too much,
-    and of none but the first it is unknown how much; else `MEASURE`.
+    1. The first of `OPTIONS` whose loss is negligible.
+    2. Otherwise consider the options that are certainly better than training on ideal forces, by
+       more than `MARGIN`, and return the first whose mean is within `MARGIN` of the best of them.
+    3. Otherwise `BUY` if every option is certainly harmful and has a known upper bound (the first
+       option needs none).
+    4. Otherwise `MEASURE`.
     """
-    known = {name: options[name] for name in OPTIONS if name in options}
-    for name, option in known.items():
-        if option.most is not None and option.most.spared:
+    known_options = {name: options[name] for name in OPTIONS if name in options}
+    for name, option in known_options.items():
+        if option.upper is not None and option.upper.is_negligible:
             return name
-    never = known[IDEAL].least
-    most = {name: option.most.loss for name, option in known.items() if option.most is not None}
+    untrained = known_options[IDEAL].lower
+    upper = {
+        name: option.upper.loss
+        for name, option in known_options.items()
+        if option.upper is not None
+    }
     better = [
-        name for name in most if never is not None and most[name].high < never.loss.low - MARGIN
+        name
+        for name in upper
+        if untrained is not None and upper[name].high < untrained.loss.low - MARGIN
     ]
     if better:
-        best = min(most[name].mean for name in better)
-        return next(name for name in better if most[name].mean <= best + MARGIN)
-    others = (
-        option.most for name, option in known.items() if name != IDEAL
-    )  # of which an untried one might win
-    lost = all(option.least is not None and option.least.hurt for option in known.values())
-    return BUY if lost and None not in others else MEASURE
+        best = min(upper[name].mean for name in better)
+        return next(name for name in better if upper[name].mean <= best + MARGIN)
+    # An option without an upper bound is untested and might still be good enough.
+    alternatives = (option.upper for name, option in known_options.items() if name != IDEAL)
+    all_harmful = all(
+        option.lower is not None and option.lower.is_harmful for option in known_options.values()
+    )
+    return BUY if all_harmful and None not in alternatives else MEASURE
 
 
 class Advice(NamedTuple):
-    """What to do about an actuator on a task."""
+    """Recommendation for an actuator on a task."""
 
     task: str
     """Task name."""
-    found: Delivery
-    """What the bench measured."""
+    delivery: Delivery
+    """Bench measurement."""
     losses: tuple[Loss, ...]
-    """Of ideal-trained policies, by axis; empty where the study has no results."""
-    options: Mapping[str, Prospect]
-    """What is known of what can be done, by `OPTIONS`; empty where the study has no results."""
+    """Losses of policies trained on ideal forces, by axis; empty if the study has no results."""
+    options: Mapping[str, LossBounds]
+    """Loss bounds by option, in the order of `OPTIONS`; empty if the study has no results."""
     verdict: str | None
     """One of `OPTIONS`, `BUY` or `MEASURE`; None without evidence."""
     reason: str
-    """Why, in a sentence."""
+    """Reason for the verdict, in a sentence."""
+
+    def summary(self) -> dict[str, Any]:
+        """Return the fields under the keys of the command line's JSON output."""
+        names = {"delivery": "found"}
+        return {names.get(name, name): value for name, value in self._asdict().items()}
 
 
 def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
-    """What to do about an actuator, of any family that is asked for forces, on a task, by the study's results."""
-    found = delivered(actuator, task)
-    losses = predicted(evidence, task, doses(found, task))
+    """Recommend an option for a force-controlled actuator on a task from the study's results."""
+    delivery = measure_on_task(actuator, task)
+    losses = predict_losses(evidence, task, severities(delivery, task))
     if len(losses) < len(AXES):
         return Advice(
-            task, found, (), {}, None, "the study has no results of this task here: measure it"
+            task, delivery, (), {}, None, "the study has no results of this task here: measure it"
         )
-    better, more = redesign(actuator, task), commanded(actuator, task, found)
-    options = known(evidence, task, doses(found, task))
-    for name, other in (
-        (LOOP, None if better is None else delivered(better, task)),
-        (COMMAND, more),
+    redesigned, boosted = (
+        redesign_loop(actuator, task),
+        with_larger_command(actuator, task, delivery),
+    )
+    options = option_bounds(evidence, task, severities(delivery, task))
+    for name, improved in (
+        (LOOP, None if redesigned is None else measure_on_task(redesigned, task)),
+        (COMMAND, boosted),
     ):
-        if other is not None:
-            options[name] = _untrained(predicted(evidence, task, doses(other, task)))
+        if improved is not None:
+            options[name] = _bounds_of_losses(
+                predict_losses(evidence, task, severities(improved, task))
+            )
+    # The study has no axis for excess force or for an offset, so that no loss is predicted for
+    # them.
     untested = ""
-    if max(found.at_rest, found.at_speed) > 1.0 + MARGIN:
-        untested = "it delivers more than is asked for"
-    if found.unasked > max(
-        0.02, found.noise / 2.0
-    ):  # the mean of noise over its correlated samples is below that
-        untested = (
-            f"it pushes with {found.unasked:.2g} of the largest force while nothing is asked for"
-        )
+    if max(delivery.at_rest, delivery.at_speed) > 1.0 + MARGIN:
+        untested = "it delivers more force than commanded"
+    # The mean of correlated noise samples stays below half their standard deviation, so that noise
+    # alone does not count as an offset.
+    if delivery.unasked > max(0.02, delivery.noise / 2.0):
+        untested = f"it delivers {delivery.unasked:.2g} of the largest force at a command of zero"
     if untested:
-        return Advice(task, found, losses, options, MEASURE, f"{untested}, which was not tested")
+        return Advice(task, delivery, losses, options, MEASURE, f"{untested}, which was not tested")
     verdict = decide(options)
-    return Advice(task, found, losses, options, verdict, _reason(verdict, options, found))
+    return Advice(task, delivery, losses, options, verdict, _reason(verdict, options, delivery))
 
 
-def predicted(evidence: Evidence, task: str, asked: Mapping[str, float]) -> tuple[Loss, ...]:
-    """What ideal-trained policies lose by doses, by axis; those of which the study knows nothing are left out."""
+def predict_losses(
+    evidence: Evidence, task: str, requested: Mapping[str, float]
+) -> tuple[Loss, ...]:
+    """Return the losses of policies trained on ideal forces, for each axis with study results."""
     return tuple(
-        one for axis, dose in asked.items() if (one := evidence.loss(task, axis, dose)) is not None
+        loss
+        for axis, severity in requested.items()
+        if (loss := evidence.loss(task, axis, severity)) is not None
     )
 
 
-def _untrained(losses: Sequence[Loss]) -> Prospect:
-    least = total(one.outcome for one in losses)
-    return Prospect(None if any(one.beyond for one in losses) else least, least)
+def _bounds_of_losses(losses: Sequence[Loss]) -> LossBounds:
+    outcome = sum_outcomes(loss.outcome for loss in losses)
+    return LossBounds(None if any(loss.beyond for loss in losses) else outcome, outcome)
 
 
-Tests = Mapping[str, Sequence[tuple[Mapping[str, float], Outcome]]]
+TestedPoints = Mapping[str, Sequence[tuple[Mapping[str, float], Outcome]]]
 
 
-def known(
-    evidence: Evidence, task: str, asked: Mapping[str, float], tests: Tests | None = None
-) -> dict[str, Prospect]:
-    """What the study knows of policies that met nothing, random actuators, or this one, at doses of every axis.
+def option_bounds(
+    evidence: Evidence, task: str, requested: Mapping[str, float], tests: TestedPoints | None = None
+) -> dict[str, LossBounds]:
+    """Return the study's loss bounds by option, for given severities on all axes.
 
-    What was lost with no less of anything is the most that is lost here, and what there was none of
-    there costs as much as it costs policies that never met it; what was lost with no more of
-    anything is the least. `tests` are those of `tests_through`, where they are at hand.
+    A test at severities at least as large on every axis gives an upper bound. If a test has less of
+    an axis than requested, the loss of ideal-trained policies on that axis is added to its result.
+    A test at severities at most as large on every axis gives a lower bound.
+
+    Args:
+        evidence: the study's rows.
+        task: task name.
+        requested: severity by axis.
+        tests: result of `tested_points`, if already computed.
     """
-    options = {IDEAL: _untrained(predicted(evidence, task, asked))}
-    for name, points in (tests or tests_through(evidence, task)).items():
-        most, least = [], []
-        for there, outcome in points:
-            over = {
-                axis: dose
-                for axis, dose in asked.items()
-                if dose > 1.005 * there.get(axis, 0.0) + 1e-9
+    # Severities are compared with a tolerance of 0.5 %, because the bench measures them with a
+    # finite time step.
+    options = {IDEAL: _bounds_of_losses(predict_losses(evidence, task, requested))}
+    for name, points in (tests or tested_points(evidence, task)).items():
+        upper, lower = [], []
+        for tested, outcome in points:
+            exceeding = {
+                axis: severity
+                for axis, severity in requested.items()
+                if severity > 1.005 * tested.get(axis, 0.0) + 1e-9
             }
-            rest = predicted(evidence, task, over)
-            if not any(one.beyond for one in rest):
-                alone = Outcome(*(np.maximum(part, 0.0) for part in outcome)) if rest else outcome
-                most.append(total([alone, *(one.outcome for one in rest)]))
-            if all(dose <= 1.005 * asked[axis] + 1e-9 for axis, dose in there.items()):
-                least.append(outcome)
-        smallest = min(most, key=lambda one: (not one.spared, one.loss.high), default=None)
-        options[name] = Prospect(smallest, max(least, key=lambda one: one.loss.low, default=None))
+            # Axes on which the test had less than requested are added as for untrained policies.
+            extra = predict_losses(evidence, task, exceeding)
+            if not any(loss.beyond for loss in extra):
+                clipped = (
+                    Outcome(*(np.maximum(part, 0.0) for part in outcome)) if extra else outcome
+                )
+                upper.append(sum_outcomes([clipped, *(loss.outcome for loss in extra)]))
+            if all(severity <= 1.005 * requested[axis] + 1e-9 for axis, severity in tested.items()):
+                lower.append(outcome)
+        lowest_upper = min(
+            upper, key=lambda loss: (not loss.is_negligible, loss.loss.high), default=None
+        )
+        options[name] = LossBounds(
+            lowest_upper, max(lower, key=lambda loss: loss.loss.low, default=None)
+        )
     return options
 
 
-def tests_through(evidence: Evidence, task: str) -> Tests:
-    """Doses that policies were tested at, and what they lost, of those trained on random actuators or through them."""
-    every = [
-        (f"{axis} {dose:g}", {axis: dose})
-        for axis, known in AXES.items()
-        for dose in known.doses[1:]
+def tested_points(evidence: Evidence, task: str) -> TestedPoints:
+    """Return tested severities and losses of policies that were not trained on ideal forces."""
+    all_tests = [
+        (f"{axis} {severity:g}", {axis: severity})
+        for axis, definition in AXES.items()
+        for severity in definition.severities[1:]
     ]
-    trained = {axis: known.trained[task] for axis, known in AXES.items() if task in known.trained}
+    training = {
+        axis: definition.training_severity[task]
+        for axis, definition in AXES.items()
+        if task in definition.training_severity
+    }
     tests: dict[str, list[tuple[str, str, dict[str, float]]]] = {
-        RANDOMISE: [(arm, *one) for arm in RANDOM for one in every],
-        THROUGH: [(axis, f"{axis} {dose:g}", {axis: dose}) for axis, dose in trained.items()],
+        RANDOMIZE: [(arm, *test) for arm in RANDOM for test in all_tests],
+        THROUGH: [
+            (axis, f"{axis} {severity:g}", {axis: severity}) for axis, severity in training.items()
+        ],
     }
     for name, real in REAL.get(task, {}).items():
         if evidence.outcome(task, name, name) is not None:
             tests[THROUGH].append(
-                (name, name, doses(delivered(posed(task, real).actuator, task), task))
+                (
+                    name,
+                    name,
+                    severities(measure_on_task(study_env(task, real).actuator, task), task),
+                )
             )
     return {
-        kind: [
-            (there, outcome)
-            for arm, test, there in each
+        option: [
+            (tested, outcome)
+            for arm, test, tested in candidates
             if (outcome := evidence.outcome(task, arm, test)) is not None
         ]
-        for kind, each in tests.items()
+        for option, candidates in tests.items()
     }
 
 
-# -- in words -------------------------------------------------------------------------------------------------
+# -- text ------------------------------------------------------------------------------------------
 
 
-def _reason(verdict: str, options: Mapping[str, Prospect], found: Delivery) -> str:
-    never = options[IDEAL]
-    says = f"policies that never met it lose {in_words(never)}"
+def _reason(verdict: str, options: Mapping[str, LossBounds], delivery: Delivery) -> str:
+    untrained = options[IDEAL]
+    text = f"policies trained on ideal forces lose {describe(untrained)}"
     if verdict in (IDEAL, BUY):
-        others = ", ".join(
-            f"{name} {in_words(option)}" for name, option in options.items() if name != IDEAL
+        alternatives = ", ".join(
+            f"{name} {describe(option)}" for name, option in options.items() if name != IDEAL
         )
-        return says if verdict == IDEAL else f"{says}, and so do all others: {others or 'none'}"
+        return (
+            text
+            if verdict == IDEAL
+            else f"{text}; all other options lose too much: {alternatives or 'none'}"
+        )
     if verdict == MEASURE:
-        untried = [
-            name for name, option in options.items() if option.most is None and name != IDEAL
+        untested = [
+            name for name, option in options.items() if option.upper is None and name != IDEAL
         ]
         return (
-            f"{says}; {' and '.join(untried) or 'what else there is'} was not tested with as much"
-            " on this task"
+            f"{text}; {' and '.join(untested) or 'any other option'} was not tested at this"
+            " severity on this task"
         )
-    by = f" by {1.0 / found.at_rest:.2f}" if verdict == COMMAND else ""
+    factor = f" by {1.0 / delivery.at_rest:.2f}" if verdict == COMMAND else ""
     chosen = options[verdict]
-    in_part = (
+    caveat = (
         ""
-        if chosen.most is not None and chosen.most.spared
+        if chosen.upper is not None and chosen.upper.is_negligible
         else ": buy another if that is too much"
     )
-    return f"{says}, with that{by} {in_words(chosen)}{in_part}"
+    return f"{text}; with this option{factor} {describe(chosen)}{caveat}"
 
 
-def in_words(option: Prospect) -> str:
-    """What is lost, with its 95 % interval, and how many policies fail."""
-    outcome = option.most or option.least
+def describe(option: LossBounds) -> str:
+    """Return a loss with its 95 % interval and the number of failing policies as text."""
+    outcome = option.upper or option.lower
     if outcome is None:
-        return "nobody knows what"
+        return "an unknown share"
     mean, low, high = outcome.loss
     failed = f"{round(outcome.failed * len(outcome.lost))} of {len(outcome.lost)} fail"
     return f"{option.bound}{mean:z.2f} of the span ({low:z.2f} to {high:z.2f}; {failed})"
 
 
-# -- measured ---------------------------------------------------------------------------------------------------
+# -- measured --------------------------------------------------------------------------------------
 
 RANDOM_EPISODES = 100
-"""Of random actions, whose mean return is the lower end of the span of a task that the study does not have."""
+"""Episodes of random actions that give the span's lower end for a task outside the study."""
 
 
 class Measurement(NamedTuple):
-    """Trainings and tests that show what an actuator costs, and what can be done about it."""
+    """Trainings and tests that measure the loss on an actuator for each option."""
 
     grid: Grid
-    """Of all of them."""
-    home: Trial
-    """Policies that were trained on ideal forces, tested there."""
+    """All trainings and tests."""
+    baseline: Trial
+    """Policies trained and tested on ideal forces."""
     options: Mapping[str, Trial]
-    """What is done -> its policies, tested on the actuator, or on its motor under a designed loop."""
+    """Option -> test of its policies, on the actuator or on its motor with a designed loop."""
 
-    def judged(self, collected: Collected) -> dict[str, Prospect]:
-        """What policies lose by what is done, for `decide`, as if the span were exact; nothing may be missing of it."""
+    def loss_bounds(self, collected: Collected) -> dict[str, LossBounds]:
+        """Return the loss by option, for `decide`; the task's span is treated as exact.
+
+        Raises:
+            ValueError: a result is missing, or the baseline is no better than random actions.
+        """
         if collected.missing:
             why = next((f": {name}: {error}" for name, error in collected.failures.items()), "")
             raise ValueError(
                 f"{len(collected.missing)} of its trainings and tests are missing{why}: run it"
                 " again"
             )
-        env = self.home.env
-        floor = FLOORS.get(env.task) if self.home.arm == _ideal_arm(env.task) else None
+        env = self.baseline.env
+        floor = FLOORS.get(env.task) if self.baseline.arm == _ideal_arm(env.task) else None
         if floor is None:
             floor = evaluate(RandomPolicy(env.action_space), env, RANDOM_EPISODES).returns.mean
         scores, succeeded = (
-            Scores(collected, {env.task: floor}, [self.home]),
-            _values(collected, self.home, "success"),
+            Scores(collected, {env.task: floor}, [self.baseline]),
+            _values(collected, self.baseline, "success"),
         )
         if not scores.ceilings:
             raise ValueError(
@@ -274,56 +340,67 @@ class Measurement(NamedTuple):
             )
         options = {}
         for name, trial in self.options.items():
-            lost = 1.0 - np.array(list(scores.of(trial).values()))
+            lost = 1.0 - np.array(list(scores.by_seed(trial).values()))
             missed = (
                 np.mean(succeeded) - _values(collected, trial, "success")
                 if len(succeeded)
                 else 0.0 * lost
             )
-            options[name] = Prospect(outcome := Outcome(lost, missed), outcome)
+            options[name] = LossBounds(outcome := Outcome(lost, missed), outcome)
         return options
 
 
-def measurement(
+def plan_measurement(
     actuator: Any, subject: str, seeds: int, root: Path, episodes: int = 50, trust: bool = False
 ) -> Measurement:
-    """What there is to be trained and tested.
+    """Plan the trainings and tests that compare all options for an actuator.
 
-    `subject` is a task, the Gymnasium id of an environment of others, or the folder of a run, whose
-    environment, agent and budget are taken; `actuator` whatever an `EnvConfig` takes; of every kind
-    there are so many runs as `seeds`, in folders below `root`. With `trust` modules are imported
-    that a run's folder names, which executes them.
+    Args:
+        actuator: anything that `EnvConfig.actuator` accepts.
+        subject: a task, the Gymnasium id of a third-party environment, or a run folder, whose
+            environment, agent and training budget are reused.
+        seeds: training runs of each kind, at least 2.
+        root: folder of the run folders.
+        episodes: test episodes of each policy.
+        trust: whether to import the modules that a run folder names, which executes them.
+
+    Raises:
+        ValueError: fewer than 2 seeds, or the actuator is ideal.
     """
     if seeds < 2:
         raise ValueError(f"seeds = {seeds}: an interval needs at least 2")
     base = _ideal_arm(subject, trust)
-    untouched = base.config.env  # and its reward: it is what policies were trained for
-    here = dataclasses.replace(untouched, actuator=actuator)
-    if all(one == IDEAL_ACTUATOR for one in here.actuators):
+    # The ideal environment is reused as it is: policies are judged by the reward of their training.
+    ideal_env = base.config.env
+    env_on_actuator = dataclasses.replace(ideal_env, actuator=actuator)
+    if all(motor_actuator == IDEAL_ACTUATOR for motor_actuator in env_on_actuator.actuators):
         raise ValueError(
             "actuator = 'ideal': training through it is training on ideal forces: name another"
         )
     env = dataclasses.replace(base.config.env, actuator=actuator)
-    through = Arm(
+    through_arm = Arm(
         f"{base.task}: through it", dataclasses.replace(base.config, env=env), base.seconds
     )
-    options = {IDEAL: Trial(base, "it", here)}
-    if (
-        "timestep" in here.source.fields and len(here.actuators) == 1
-    ):  # a loop is designed, and a lag drawn, for one
-        better = redesign(here.actuators[0], base.task)
-        if better is not None:
-            options[LOOP] = Trial(base, "designed", dataclasses.replace(untouched, actuator=better))
-        options[RANDOMISE] = Trial(generic(base), "it", here)
-    options[THROUGH] = Trial(through, "it", here)
-    home = Trial(base, "ideal", untouched)
+    options = {IDEAL: Trial(base, "it", env_on_actuator)}
+    # The loop design and the random lag are defined for a single actuator.
+    if "timestep" in env_on_actuator.source.fields and len(env_on_actuator.actuators) == 1:
+        redesigned = redesign_loop(env_on_actuator.actuators[0], base.task)
+        if redesigned is not None:
+            options[LOOP] = Trial(
+                base, "designed", dataclasses.replace(ideal_env, actuator=redesigned)
+            )
+        options[RANDOMIZE] = Trial(generic(base), "it", env_on_actuator)
+    options[THROUGH] = Trial(through_arm, "it", env_on_actuator)
+    baseline = Trial(base, "ideal", ideal_env)
     return Measurement(
-        Grid(root, (home, *options.values()), lambda _: range(seeds), episodes), home, options
+        Grid(root, (baseline, *options.values()), lambda _: range(seeds), episodes),
+        baseline,
+        options,
     )
 
 
 def _ideal_arm(subject: str, trust: bool = False) -> Arm:
-    """The training on ideal forces: the study's, that of a run, or the default one of a world."""
+    """Return the arm trained on ideal forces: the study's, a run's or the source's default."""
     if subject in SECONDS:
         return ideal(subject)
     if (Path(subject) / "config.json").is_file():
@@ -331,6 +408,7 @@ def _ideal_arm(subject: str, trust: bool = False) -> Arm:
     else:
         env = EnvConfig(subject)
         config = TrainConfig.preset(subject, env.source.default_agent(env))
+    # Evaluations and checkpoints during training would only cost time.
     never = max(config.total_steps or 10**9, 10**9)
     env = dataclasses.replace(
         config.env, actuator=IDEAL_ACTUATOR, randomize=None, allow_unstable=False

@@ -1,4 +1,4 @@
-"""One hinge that an actuator drives, in the engine: how fast its torque comes, how exact, and how much; in doses."""
+"""Bench test of an actuator: one hinge in MuJoCo measures delay, gain and noise as severities."""
 
 import dataclasses
 from collections.abc import Callable
@@ -9,23 +9,29 @@ import numpy as np
 
 from codrl_mj.actuators import DCMotorActuator, Drive, GearMotor, SampledLoop, Supply
 from codrl_mj.engine.specs import add_motors
-from codrl_mj.study.doses import REFERENCE_SPEEDS, noise, timestep
-from codrl_mj.study.grid import check_chosen
+from codrl_mj.study.axes import REFERENCE_SPEEDS, noise, timestep
+from codrl_mj.study.grid import check_selection
 from codrl_mj.tasks import find_task
 
-BLOCKED = 1e12
-"""Inertia [kg*m^2] that nothing here turns."""
-HORIZON = 20.0
-"""Steps of the policy after which a force counts as not there."""
+BLOCKED_INERTIA = 1e12
+"""Inertia [kg*m^2] so large that the hinge stays at its speed."""
+HORIZON_STEPS = 20.0
+"""Duration of a bench measurement in policy steps; a force that comes later does not count."""
 
 
-def on_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., np.ndarray]:
-    """One hinge with a load of some inertia [kg*m^2] that an actuator drives in steps of `timestep` [s], to be run."""
+def make_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., np.ndarray]:
+    """Build a hinge with an actuator and return a function that runs it.
+
+    Args:
+        actuator: the actuator that drives the hinge.
+        timestep: integration step [s].
+        inertia: inertia of the load [kg*m^2].
+    """
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.compiler.boundmass = timestep, 0.0
-    spec.option.tolerance = (
-        0.0  # it is relative to the inertia, beside which friction would count as none
-    )
+    # The solver's tolerance is relative to the inertia: with a huge one the solver would stop
+    # before it has resolved the friction.
+    spec.option.tolerance = 0.0
     body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
     body.add_joint(name="hinge", axis=[0.0, 0.0, 1.0])
     spec.add_actuator(target="hinge", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
@@ -33,10 +39,11 @@ def on_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., np
     data, moved = mujoco.MjData(model), inertia + actuator.additions.armature
 
     def run(torque: float, duration: float, speed: float = 0.0) -> np.ndarray:
-        """Ask for a torque [N*m] at the joint for a `duration` [s], from a speed of the joint [rad/s].
+        """Command a torque [N*m] for a `duration` [s], starting at a speed of the joint [rad/s].
 
-        Shape (steps, 3): the actuator's torque [N*m] in each step, that which accelerates the hinge
-        [N*m], and its speed [rad/s] after the step.
+        Returns:
+            Shape (steps, 3): the actuator's torque [N*m], the torque that accelerates the hinge
+            [N*m], and the hinge's speed [rad/s] after the step.
         """
         mujoco.mj_resetData(model, data)
         data.ctrl[:], data.qvel[:] = torque, speed
@@ -50,139 +57,158 @@ def on_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., np
 
 
 class Delivery(NamedTuple):
-    """What an actuator makes of a command within `HORIZON`, in steps of the policy and shares of the largest force.
+    """Response of an actuator to a command within `HORIZON_STEPS`.
 
-    A loop that is quick at first and creeps to its end much later is thus called quick and weak:
-    that is what a policy meets, whose commands change long before.
+    Times are in policy steps, forces in shares of the task's largest force. A loop that rises fast
+    and then creeps to its final value counts as fast and weak, because a policy changes its command
+    long before that value is reached.
     """
 
     dead_time: float
-    """Until a thousandth of what comes in the end is there [steps]."""
+    """Time until a thousandth of the final force is delivered [steps]."""
     lag: float
-    """Average residence time less the dead time [steps]: the time constant of the first-order lag
-    that comes as late; ringing counts as lateness. Source: Astrom, Hagglund, *PID Controllers*, 2nd
-    ed., section 2.4 (area methods).
+    """Average residence time minus the dead time [steps]: the time constant of an equivalent
+    first-order lag. Ringing counts as lag. Source: Astrom, Hagglund, *PID Controllers*, 2nd ed.,
+    section 2.4 (area methods).
     """
     at_rest: float
-    """What is there in the end, while the joint is blocked."""
+    """Final force with the joint blocked [largest force]."""
     at_speed: float
-    """The same at the reference speed, while it drives."""
+    """Final force while driving at the reference speed [largest force]."""
     friction: float
-    """What brakes the joint while nothing is asked for [largest force]: the larger of all of it at
-    a twentieth of the reference speed, and of what the actuator rubs away itself at that speed,
-    where its back-EMF is no friction.
+    """Braking force at zero command [largest force]: the larger of the total at a twentieth of the
+    reference speed, and of the mechanical losses at the reference speed, which exclude the
+    back-EMF.
     """
     noise: float
     """Standard deviation of the force [largest force] from one integration step to the next."""
     unasked: float
-    """Mean force [largest force] at rest while nothing is asked for, either sign."""
+    """Magnitude of the mean force at rest and zero command [largest force]."""
 
 
-def delivery(actuator: Any, timestep: float, step: float, force: float, speed: float) -> Delivery:
-    """Measure what an actuator makes of commands up to a force [N*m; N on a slide] at a reference speed [rad/s; m/s].
+def measure_delivery(
+    actuator: Any, timestep: float, step: float, force: float, speed: float
+) -> Delivery:
+    """Measure the response of an actuator to a command.
 
-    `timestep` is that of the integration, `step` the policy's [s].
+    Args:
+        actuator: the actuator.
+        timestep: integration step [s].
+        step: policy step [s].
+        force: largest command [N*m; N on a slide].
+        speed: reference speed [rad/s; m/s].
     """
-    duration = HORIZON * step
-    blocked = on_bench(actuator, timestep, BLOCKED)
-    unasked = blocked(0.0, duration)[:, 0]  # its noise is every run's, and thus taken from them
+    duration = HORIZON_STEPS * step
+    blocked = make_bench(actuator, timestep, BLOCKED_INERTIA)
+    # Every run draws the same noise, so that subtracting the run at zero command removes it.
+    unasked = blocked(0.0, duration)[:, 0]
 
-    def asked(at: float) -> np.ndarray:
-        return (blocked(force, duration, at)[:, 0] - unasked) / force
+    def delivered_torque(joint_speed: float) -> np.ndarray:
+        return (blocked(force, duration, joint_speed)[:, 0] - unasked) / force
 
-    def braked(at: float) -> tuple[float, float]:
-        turned = _end(on_bench(actuator, timestep, 1e4 * force * duration / at)(0.0, duration, at))
+    # The inertia is so large that friction hardly slows the hinge within the measurement.
+    def braking(joint_speed: float) -> tuple[float, float]:
+        turned = _end(
+            make_bench(actuator, timestep, 1e4 * force * duration / joint_speed)(
+                0.0, duration, joint_speed
+            )
+        )
         driven, moved, _ = np.mean(turned, axis=0)
         return float(np.mean(_end(unasked)) - moved) / force, float(driven - moved) / force
 
-    torques = asked(0.0)
+    # The area between the step response and its final value is the average residence time.
+    torques = delivered_torque(0.0)
     last = float(np.mean(_end(torques)))
-    begun = np.flatnonzero(np.abs(torques) > 1e-3 * abs(last))
-    dead = int(begun[0]) if len(begun) else 0
+    started = np.flatnonzero(np.abs(torques) > 1e-3 * abs(last))
+    dead = int(started[0]) if len(started) else 0
     lag = max(float(np.sum(np.abs(1.0 - torques / last))) - dead, 0.0) if last else 0.0
     settled = unasked[len(unasked) // 2 :] / force
     return Delivery(
         dead_time=dead * timestep / step,
         lag=lag * timestep / step,
         at_rest=last,
-        at_speed=float(np.mean(_end(asked(speed)))),
-        friction=max(braked(0.05 * speed)[0], braked(speed)[1], 0.0),
+        at_speed=float(np.mean(_end(delivered_torque(speed)))),
+        friction=max(braking(0.05 * speed)[0], braking(speed)[1], 0.0),
         noise=float(np.std(settled)),
         unasked=abs(float(np.mean(settled))),
     )
 
 
 def _end(rows: np.ndarray) -> np.ndarray:
-    """The last step of the policy."""
-    return rows[-max(round(len(rows) / HORIZON), 1) :]
+    """Return the rows of the last policy step."""
+    return rows[-max(round(len(rows) / HORIZON_STEPS), 1) :]
 
 
-# -- on a task of the study ---------------------------------------------------------------------------------------
+# -- on a task of the study ------------------------------------------------------------------------
 
 
-def delivered(actuator: Any, task: str, share: float = 1.0) -> Delivery:
-    """What an actuator makes of the commands of a task, on the bench, or of a `share` of its largest force."""
-    check_chosen("task", [task], REFERENCE_SPEEDS)
+def measure_on_task(actuator: Any, task: str, share: float = 1.0) -> Delivery:
+    """Measure the response of an actuator to a `share` of the largest force of a task."""
+    check_selection("task", [task], REFERENCE_SPEEDS)
     if actuator.MOTION:
         raise ValueError(
             f"actuator: a {actuator.family} is asked for motion, not for forces: name one of"
             " another family"
         )
-    known = find_task(task)
-    return delivery(
+    definition = find_task(task)
+    return measure_delivery(
         actuator,
         timestep(task),
-        known.step_duration,
-        share * known.max_force,
+        definition.step_duration,
+        share * definition.max_force,
         REFERENCE_SPEEDS[task],
     )
 
 
-def doses(found: Delivery, task: str) -> dict[str, float]:
-    """The dose of every axis that does to a command what the actuator does, as it was `found` on the task, by axis.
+def severities(delivery: Delivery, task: str) -> dict[str, float]:
+    """Return the severity on each axis that has the same effect as the measured actuator.
 
-    Weakness g and a supply that lacks a share d leave g*min(1, 2*(1 - d)) of the largest force at
-    rest, and g*(1 - 2*d) at the reference speed (`doses.supply`): solved for both, with g at most
-    1.
+    A gain g (weakness 1 - g) and a supply that lacks a share d leave g*min(1, 2*(1 - d)) of the
+    largest force at rest and g*(1 - 2*d) at the reference speed (`axes.supply`). Both equations are
+    solved for g <= 1 and d.
     """
-    rest, speed = max(found.at_rest, 0.0), min(found.at_speed, found.at_rest)
+    rest, speed = max(delivery.at_rest, 0.0), min(delivery.at_speed, delivery.at_rest)
     strength = rest if speed >= 0.0 else rest - speed
     if rest == 0.0:
-        lacks = 1.0
+        missing = 1.0
     elif speed >= 0.0:
-        lacks = (1.0 - speed / rest) / 2.0
+        missing = (1.0 - speed / rest) / 2.0
     else:
-        lacks = 1.0 - rest / (2.0 * strength)
-    loud = found.noise and found.noise / delivered(noise(task, 1.0).actuator, task).noise
+        missing = 1.0 - rest / (2.0 * strength)
+    noise_severity = (
+        delivery.noise and delivery.noise / measure_on_task(noise(task, 1.0).actuator, task).noise
+    )
     return {
-        "lag": found.lag,
+        "lag": delivery.lag,
         "weakness": max(1.0 - strength, 0.0),
-        "supply": lacks,
-        "delay": found.dead_time,
-        "friction": found.friction,
-        "noise": loud,
+        "supply": missing,
+        "delay": delivery.dead_time,
+        "friction": delivery.friction,
+        "noise": noise_severity,
     }
 
 
-def commanded(actuator: Any, task: str, found: Delivery) -> Delivery | None:
-    """What comes of commands that are larger by what is lost at rest, where that is more than a fiftieth.
+def with_larger_command(actuator: Any, task: str, delivery: Delivery) -> Delivery | None:
+    """Return the response to commands scaled up to make up for the force lost at rest.
 
-    None for a loop that could be designed: what it has not delivered yet is no gear's loss.
+    None if the loss is below 2 %, or if the loop can be redesigned: then the missing force is late,
+    not lost.
     """
-    if not 0.1 < found.at_rest < 0.98 or redesign(actuator, task) is not None:
+    if not 0.1 < delivery.at_rest < 0.98 or redesign_loop(actuator, task) is not None:
         return None
-    more = 1.0 / found.at_rest
-    there = delivered(actuator, task, more)
-    share = {name: min(getattr(there, name) * more, 1.0) for name in ("at_rest", "at_speed")}
-    scaled = {name: getattr(there, name) * more for name in ("friction", "noise", "unasked")}
-    return there._replace(**share, **scaled)
+    factor = 1.0 / delivery.at_rest
+    boosted = measure_on_task(actuator, task, factor)
+    shares = {name: min(getattr(boosted, name) * factor, 1.0) for name in ("at_rest", "at_speed")}
+    scaled = {name: getattr(boosted, name) * factor for name in ("friction", "noise", "unasked")}
+    return boosted._replace(**shares, **scaled)
 
 
-def redesign(actuator: Any, task: str) -> Drive | None:
-    """The same motor and supply under a designed loop; None if it has one, or no loop that could be designed."""
-    if isinstance(actuator, DCMotorActuator):  # what a sensor gets wrong no loop makes right
-        wrong = actuator.controller.current_noise or actuator.controller.current_bias
-        return None if wrong else redesigned(actuator, task)
+def redesign_loop(actuator: Any, task: str) -> Drive | None:
+    """Return the same motor and supply with a designed loop; None if that changes nothing."""
+    if isinstance(actuator, DCMotorActuator):
+        # No loop corrects an error of the current sensor.
+        sensor_error = actuator.controller.current_noise or actuator.controller.current_bias
+        return None if sensor_error else drive_with_designed_loop(actuator, task)
     if isinstance(actuator, Drive):
         loop = dataclasses.replace(
             actuator.controller, bandwidth=0.0, kp=0.0, ki=0.0, anti_windup="back_calculation"
@@ -193,8 +219,8 @@ def redesign(actuator: Any, task: str) -> Drive | None:
     return None
 
 
-def redesigned(actuator: DCMotorActuator, task: str) -> Drive:
-    """The motor and supply of a current loop under a designed one: pole-zero cancellation, anti-windup, a limit."""
+def drive_with_designed_loop(actuator: DCMotorActuator, task: str) -> Drive:
+    """Return a `Drive` with the same motor and supply, a designed loop and a current limit."""
     motor, voltage = actuator.motor, actuator.controller.max_voltage
     if actuator.supply is not None:
         voltage = min(voltage, actuator.supply.voltage)

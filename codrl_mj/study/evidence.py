@@ -1,4 +1,4 @@
-"""What policies lost when the studies tested them, policy by policy: read from the rows that these publish."""
+"""Losses of every policy in every test of the studies, read from the published rows."""
 
 import csv
 import functools
@@ -10,60 +10,65 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.evaluation.measures import Interval
-from codrl_mj.study.doses import AXES
+from codrl_mj.study.axes import AXES
 from codrl_mj.study.inference import Stratum, effect
 from codrl_mj.study.questions import MARGIN
-from codrl_mj.study.trials import FAILED, RUNS
+from codrl_mj.study.trials import FAILURE_MARGIN, RUNS
 
-SPARED = 0.1
-"""Share of policies that may fail, and of success that may be lost, where nothing is said to be lost."""
+MAX_FAILED_SHARE = 0.1
+"""Largest share of failing policies, and of lost success, for a loss to count as negligible."""
 _PACKAGE = Path(__file__).parents[1]
 EVIDENCE = (_PACKAGE / "_assets" / "study", _PACKAGE.parent / "docs" / "results")
-"""Where the studies' folders with their rows lie: in a wheel, in a checkout."""
+"""Parents of the studies' folders of rows: in a wheel, and in a checkout."""
 STUDIES = ("actuators", "insurance")
 _COLUMNS = ("task", "trained", "tested", "seed", "score", "success")
 
 
 class Outcome(NamedTuple):
-    """What policies of one kind lose, each of them, beside those that meet ideal forces."""
+    """Loss of each policy of one kind, relative to policies on ideal forces."""
 
     lost: np.ndarray
-    """Shares of the task's span, shape (policies,)."""
+    """Lost share of the task's span, shape (policies,)."""
     missed: np.ndarray
-    """Shares of episodes that no longer succeed, shape (policies,); 0 where the task knows no success."""
+    """Lost share of successful episodes, shape (policies,); 0 if the task has no success."""
 
     @property
     def loss(self) -> Interval:
-        """Mean, and its 95 % interval by Student's t over policies."""
+        """Mean lost share of the span, with its 95 % interval by Student's t over policies."""
         return _interval(self.lost)
 
     @property
     def success_lost(self) -> Interval:
-        """Mean share of episodes that no longer succeed, with its interval."""
+        """Mean lost share of successful episodes, with its 95 % interval."""
         return _interval(self.missed)
 
     @property
     def failed(self) -> float:
-        """Share of policies that lose more than `FAILED`."""
-        return float(np.mean(self.lost > FAILED))
+        """Share of policies whose loss exceeds `FAILURE_MARGIN`."""
+        return float(np.mean(self.lost > FAILURE_MARGIN))
 
     @property
-    def spared(self) -> bool:
-        """Whether nothing that matters is lost.
+    def is_negligible(self) -> bool:
+        """True if the loss is negligible.
 
-        No more than `MARGIN` of the score on the mean, and surely no more than `FAILED`; by no more
-        than a tenth of the policies more than that; and no more than a tenth of the success.
+        All of these hold: the mean loss is at most `MARGIN`, its interval ends at or below
+        `FAILURE_MARGIN`, at most a tenth of the policies fail, and at most a tenth of the success
+        is lost.
         """
-        within = self.loss.mean <= MARGIN and self.loss.high <= FAILED
-        return within and self.failed <= SPARED and self.success_lost.mean <= SPARED
+        within = self.loss.mean <= MARGIN and self.loss.high <= FAILURE_MARGIN
+        return (
+            within
+            and self.failed <= MAX_FAILED_SHARE
+            and self.success_lost.mean <= MAX_FAILED_SHARE
+        )
 
     @property
-    def hurt(self) -> bool:
-        """Whether surely more is lost than `FAILED` of the score, or a tenth of the success: by 95 % intervals."""
-        return self.loss.low > FAILED or self.success_lost.low > SPARED
+    def is_harmful(self) -> bool:
+        """True if a 95 % interval lies above `FAILURE_MARGIN` or above a tenth of the success."""
+        return self.loss.low > FAILURE_MARGIN or self.success_lost.low > MAX_FAILED_SHARE
 
     def summary(self) -> dict[str, Any]:
-        """What to say of it: numbers in shares."""
+        """Return summary statistics as JSON-serializable shares."""
         return {
             "policies": len(self.lost),
             "loss": self.loss._asdict(),
@@ -74,59 +79,72 @@ class Outcome(NamedTuple):
         }
 
 
-def total(outcomes: Iterable[Outcome]) -> Outcome:
-    """Losses added up, policy by policy, as if they were of one thing each; no more than everything."""
-    several = list(outcomes)
-    fewest = min(len(one.lost) for one in several)
-    lost, missed = (sum(part[:fewest] for part in parts) for parts in zip(*several, strict=True))
+def sum_outcomes(outcomes: Iterable[Outcome]) -> Outcome:
+    """Add losses policy by policy, as if their causes were independent; the sum is at most 1."""
+    terms = list(outcomes)
+    count = min(len(outcome.lost) for outcome in terms)
+    lost, missed = (sum(part[:count] for part in parts) for parts in zip(*terms, strict=True))
     return Outcome(np.minimum(lost, 1.0), np.minimum(missed, 1.0))
 
 
 class Loss(NamedTuple):
-    """What ideal-trained policies lose by one thing."""
+    """Loss of policies trained on ideal forces at one severity of one axis."""
 
     axis: str
-    """What it is."""
-    dose: float
-    """How much of it."""
+    """Name of the axis."""
+    severity: float
+    """Severity, in the unit of the axis."""
     outcome: Outcome
-    """Policy by policy; of the largest dose that was tested if it is `beyond`."""
+    """Loss of each policy; at the largest tested severity if `beyond`."""
     beyond: bool
-    """Whether no dose as large was tested, so that it loses at least as much."""
+    """True if the severity exceeds all tested ones, so that `outcome` is a lower bound."""
     between: tuple[str, ...]
-    """The tests that it was interpolated between."""
+    """Names of the tests between which the loss was interpolated."""
+
+    def summary(self) -> dict[str, Any]:
+        """Return the fields under the keys of the command line's JSON output."""
+        names = {"severity": "dose"}
+        return {names.get(name, name): value for name, value in self._asdict().items()}
 
 
 class Evidence:
-    """The study's rows: what every policy scored in every test."""
+    """Scores of every policy in every test of the studies."""
 
     def __init__(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Index the rows: `task`, `trained`, `tested`, `seed`, `score` [share of the span], `success`; or empty."""
-        self.rows = [row for row in rows if row["score"]]  # empty: the task's span was not known
+        """Index rows by task, arm and test.
+
+        Args:
+            rows: mappings with the columns `task`, `trained`, `tested`, `seed`, `score` [share of
+                the span] and `success`; the last two may be empty.
+        """
+        # The score is empty if the task's span was unknown when the row was written.
+        self.rows = [row for row in rows if row["score"]]
         self._tested: dict[tuple[str, str, str], dict[int, tuple[float, float]]] = {}
         for row in self.rows:
-            found = self._tested.setdefault((row["task"], row["trained"], row["tested"]), {})
-            found[int(row["seed"])] = float(row["score"]), float(row["success"] or math.nan)
+            by_seed = self._tested.setdefault((row["task"], row["trained"], row["tested"]), {})
+            by_seed[int(row["seed"])] = float(row["score"]), float(row["success"] or math.nan)
         self._curve = functools.cache(self._curve_of)
 
     @classmethod
     def read(cls, *files: Path) -> "Evidence":
-        """Read files; those of the checkout or the wheel unless some are given, and none if there are none."""
-        there = [
+        """Read files of rows; without arguments, those of the checkout or the wheel, if any."""
+        published = [
             path
             for folder in EVIDENCE
             for study in STUDIES
             if (path := folder / study / RUNS).is_file()
         ]
         rows: list[dict[str, str]] = []
-        for path in files or there:
-            with path.open(newline="", encoding="utf-8") as opened:
-                rows += (found := list(csv.DictReader(opened)))
-            if lacking := [name for name in _COLUMNS if found and name not in found[0]]:
+        for path in files or published:
+            with path.open(newline="", encoding="utf-8") as file:
+                rows += (file_rows := list(csv.DictReader(file)))
+            if missing_columns := [
+                name for name in _COLUMNS if file_rows and name not in file_rows[0]
+            ]:
                 raise ValueError(
-                    f"{path}: has no column {lacking[0]!r}: give the {RUNS} of the study"
+                    f"{path}: has no column {missing_columns[0]!r}: give the {RUNS} of the study"
                 )
-            for number, row in enumerate(found, start=2):
+            for number, row in enumerate(file_rows, start=2):
                 for key in ("score", "success"):
                     try:
                         finite = math.isfinite(float(row[key] or 0.0))
@@ -139,68 +157,88 @@ class Evidence:
         return cls(rows)
 
     def without(self, *tested: str) -> "Evidence":
-        """The same without some tests, such as `lag 2` or `marginal motor`."""
+        """Return a copy without some tests, such as `lag 2` or `marginal motor`."""
         return Evidence(row for row in self.rows if row["tested"] not in tested)
 
     def outcome(
-        self, task: str, trained: str, tested: str, besides: str | None = None
+        self, task: str, trained: str, tested: str, paired_test: str | None = None
     ) -> Outcome | None:
-        """What policies lost in a test, by seed; None with fewer than two policies.
+        """Return the losses of an arm's policies in a test; None with fewer than two policies.
 
-        `trained` is an arm, without the task. Each policy is compared with itself in another test,
-        or, unless that is given, with the mean of those that were trained and tested on ideal
-        forces.
+        Args:
+            task: task name.
+            trained: name of the arm, without the task.
+            tested: name of the test.
+            paired_test: test in which the same policies are the reference; None takes the mean of
+                the policies that were trained and tested on ideal forces.
         """
-        found, home = (
+        scores, ideal_scores = (
             self._tested.get((task, trained, tested), {}),
             self._tested.get((task, "ideal", "ideal"), {}),
         )
-        if besides is not None:
-            paired = self._tested.get((task, trained, besides), {})
+        if paired_test is not None:
+            paired = self._tested.get((task, trained, paired_test), {})
             values = [
-                np.subtract(paired[seed], found[seed])
-                for seed in sorted(found.keys() & paired.keys())
+                np.subtract(paired[seed], scores[seed])
+                for seed in sorted(scores.keys() & paired.keys())
             ]
         else:
-            level = np.mean(list(home.values()), axis=0) if home else np.full(2, math.nan)
-            values = [level - found[seed] for seed in sorted(found)] if home else []
+            level = (
+                np.mean(list(ideal_scores.values()), axis=0)
+                if ideal_scores
+                else np.full(2, math.nan)
+            )
+            values = [level - scores[seed] for seed in sorted(scores)] if ideal_scores else []
         return Outcome(*np.nan_to_num(np.transpose(values))) if len(values) >= 2 else None
 
-    def loss(self, task: str, axis: str, dose: float) -> Loss | None:
-        """What ideal-trained policies lose by a dose >= 0, in the axis' unit; None if the study does not know.
+    def loss(self, task: str, axis: str, severity: float) -> Loss | None:
+        """Return the loss of ideal-trained policies at a severity >= 0; None without study results.
 
-        Every policy's own losses are interpolated between the doses that were tested.
+        The losses of each policy are interpolated linearly between the tested severities.
         """
         curve = self._curve(task, axis)
         if len(curve) < 2:
             return None
         tested = list(curve)
-        index = min(max(int(np.searchsorted(tested, dose)), 1), len(tested) - 1)
+        index = min(max(int(np.searchsorted(tested, severity)), 1), len(tested) - 1)
         low, high = tested[index - 1], tested[index]
-        share = min((dose - low) / (high - low), 1.0)
+        share = min((severity - low) / (high - low), 1.0)
         outcome = Outcome(
             *(
-                (1.0 - share) * one + share * other
-                for one, other in zip(curve[low], curve[high], strict=True)
+                (1.0 - share) * low_part + share * high_part
+                for low_part, high_part in zip(curve[low], curve[high], strict=True)
             )
         )
         between = {
-            f"{axis} {at:g}" for at, weight in ((low, 1.0 - share), (high, share)) if at and weight
+            f"{axis} {test_severity:g}"
+            for test_severity, weight in ((low, 1.0 - share), (high, share))
+            if test_severity and weight
         }
-        return Loss(axis, dose, outcome, dose > 1.005 * tested[-1], tuple(sorted(between)))
+        return Loss(axis, severity, outcome, severity > 1.005 * tested[-1], tuple(sorted(between)))
 
     def _curve_of(self, task: str, axis: str) -> dict[float, Outcome]:
-        """Dose -> what ideal-trained policies lose by it, of those that were tested, none first."""
-        doses, none = AXES[axis].doses, f"{axis} 0" if AXES[axis].own_motor else "ideal"
+        """Return severity -> loss of ideal-trained policies, for 0 and every tested severity."""
+        severities, reference_test = (
+            AXES[axis].severities,
+            f"{axis} 0" if AXES[axis].motor_at_zero else "ideal",
+        )
         outcomes = {
-            dose: self.outcome(task, "ideal", f"{axis} {dose:g}", none) for dose in doses[1:]
+            severity: self.outcome(task, "ideal", f"{axis} {severity:g}", reference_test)
+            for severity in severities[1:]
         }
-        found = {dose: outcome for dose, outcome in outcomes.items() if outcome is not None}
-        if not found:
+        available = {
+            severity: outcome for severity, outcome in outcomes.items() if outcome is not None
+        }
+        if not available:
             return {}
-        fewest = min(len(one.lost) for one in found.values())
-        cut = {dose: Outcome(one.lost[:fewest], one.missed[:fewest]) for dose, one in found.items()}
-        return {0.0: Outcome(np.zeros(fewest), np.zeros(fewest))} | cut
+        count = min(len(outcome.lost) for outcome in available.values())
+        # Losses are interpolated policy by policy, so every severity needs the same policies: seeds
+        # that some test lacks are cut off.
+        cut = {
+            severity: Outcome(outcome.lost[:count], outcome.missed[:count])
+            for severity, outcome in available.items()
+        }
+        return {0.0: Outcome(np.zeros(count), np.zeros(count))} | cut
 
 
 def _interval(values: Sequence[float] | np.ndarray) -> Interval:

@@ -1,7 +1,7 @@
-"""A grid of trainings and tests: every cell an ordinary run folder, found again by its configuration, trained once.
+"""Grid of trainings and tests; each cell is a run folder, named by its configuration.
 
-A grid that was killed goes on where it was: what is finished is left alone, trainings that were
-begun continue from their checkpoints.
+A grid that was killed can be run again: finished cells are skipped, and started trainings continue
+from their checkpoints.
 """
 
 import dataclasses
@@ -28,55 +28,56 @@ from codrl_mj.training import (
 )
 
 _FAILURES, _DEPLOYMENTS = "failures", "deployments"
-_PATIENCE = 120.0  # s to wait for a run folder that a dying process of a killed grid still holds
+# Time [s] to wait for a run folder that a terminating process of a killed grid still locks.
+_LOCK_TIMEOUT = 120.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Deployment:
-    """The last policy of a run, put to work on an actuator."""
+    """Test of a run's last policy on an actuator."""
 
     run: Path
     """Finished run folder."""
     env: EnvConfig
-    """Actuator and all else but actions and observations, which are those of the training."""
+    """Environment of the test, except actions and observations, which are those of the training."""
     episodes: int = 100
-    """Episodes."""
+    """Number of episodes."""
     seed: int = 0
     """Seed of the first episode."""
 
     @functools.cached_property
     def record(self) -> Path:
-        """The JSON file of the result, in the run folder."""
+        """JSON file of the result, in the run folder."""
         identity = {**vars(self), "env": self.env.as_mapping(), "run": None}
         return self.run / _DEPLOYMENTS / f"{_digest(identity)}.json"
 
 
-def check_chosen(field: str, given: Sequence[str], known: Iterable[str]) -> None:
-    """Refuse a choice, called `field`, of nothing, or of what is not known: the nearest known one is suggested."""
+def check_selection(field: str, names: Sequence[str], known: Iterable[str]) -> None:
+    """Raise ValueError if a selection is empty or has an unknown name; suggest the nearest one."""
     known = list(known)
-    for name in given:
+    for name in names:
         if name not in known:
             raise ValueError(
                 f"{field}: unknown {name!r}: {did_you_mean(name, known)}Known are"
                 f" {', '.join(known)}"
             )
-    if not given:
-        raise ValueError(f"{field}: none is named: name one or more of {', '.join(known)}")
+    if not names:
+        raise ValueError(f"{field}: empty: name one or more of {', '.join(known)}")
 
 
 def cell_folder(root: Path, config: TrainConfig) -> Path:
-    """The run folder of a configuration: readable, and different for any other configuration."""
+    """Return the run folder of a configuration; its name ends with a digest of it."""
     return root / f"{config.task}-{config.agent.name}-s{config.seed}-{_digest(config.as_mapping())}"
 
 
 def read_failure(cell: Path | Deployment) -> str | None:
-    """Why a cell (run folder or test) was not finished when it was tried last, in a line; None if it did not fail."""
+    """Return the error of a cell's last attempt (run folder or test) in a line; None if none."""
     record = failure_record(cell)
     return str(read_json(record, "record of a failure")["error"]) if record.is_file() else None
 
 
 def failure_record(cell: Path | Deployment) -> Path:
-    """The JSON file of what went wrong with a cell: the error, its traceback and the configuration."""
+    """Return the JSON file of a cell's failure: error, traceback and configuration."""
     if isinstance(cell, Deployment):
         return cell.run.parent / _FAILURES / f"{cell.run.name}-{cell.record.stem}.json"
     return cell.parent / _FAILURES / f"{cell.name}.json"
@@ -88,10 +89,17 @@ def train_runs(
     on_run: Callable[[Path], None] = lambda _: None,
     **options: Any,
 ) -> dict[Path, str]:
-    """Train every run that is not finished; what went wrong, by run folder. `options` are those of `training.train`.
+    """Train every run that is not finished.
 
-    `on_run` is called with a folder when it is finished or has failed; those finished before come
-    first.
+    Args:
+        runs: run folder -> configuration.
+        workers: processes that compute.
+        on_run: called with a folder when its training has finished or failed; runs that were
+            finished before come first.
+        **options: further arguments of `training.train`.
+
+    Returns:
+        Run folder -> error, for failed trainings.
     """
     work = {
         folder: (folder, {"train": config.as_mapping()}, _train, config, folder, options)
@@ -106,10 +114,13 @@ def deploy_cells(
     workers: Workers = Workers(),  # noqa: B008 - frozen
     on_cell: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Evaluate policies, by names of their tests, that were not evaluated before: records of `Evaluation.as_mapping()`.
+    """Run every test that has no record yet; a record is an `Evaluation.as_mapping()`.
 
-    `on_cell` is called with a name when its policy is evaluated or that failed; those evaluated
-    before come first.
+    Args:
+        deployments: name of the test -> test.
+        workers: processes that compute.
+        on_cell: called with a name when its test has finished or failed; tests that were finished
+            before come first.
     """
     work = {
         name: (test, {"test": name, "run": test.run.name}, _deploy, test)
@@ -125,7 +136,7 @@ def _compute(
     workers: Workers,
     on_cell: Callable[[Any], None],
 ) -> dict[Any, str]:
-    """Do the work that there is for cells, arguments of `_attempt`; what went wrong. A failure stops no other cell."""
+    """Call `_attempt` for each cell with work; return the errors by cell."""
     for cell in cells:
         if cell not in work:
             on_cell(cell)
@@ -142,11 +153,11 @@ def _compute(
 def _attempt(
     name: Any,
     cell: Path | Deployment,
-    about: Mapping[str, Any],
+    context: Mapping[str, Any],
     function: Callable[..., None],
     *arguments: Any,
 ) -> tuple[Any, str | None]:
-    """Call a function: the name, and what went wrong in a line, of which a record is kept until nothing does."""
+    """Call a function; return the name and its error in a line, which a file records."""
     record = failure_record(cell)
     try:
         function(*arguments)
@@ -156,7 +167,7 @@ def _attempt(
         line = " ".join(str(error).split()) or type(error).__name__
         write_json(
             record,
-            {"error": line, "traceback": "".join(traceback.format_exception(error)), **about},
+            {"error": line, "traceback": "".join(traceback.format_exception(error)), **context},
         )
         return name, line
     record.unlink(missing_ok=True)
@@ -164,14 +175,14 @@ def _attempt(
 
 
 def _train(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> None:
-    """Train one run, waiting for a folder that somebody else holds."""
+    """Train one run, waiting while another process locks its folder."""
     start = time.monotonic()
     while True:
         try:
             train(config, folder, resume=True, **options)
             return
         except RunInUseError:
-            if time.monotonic() - start > _PATIENCE:
+            if time.monotonic() - start > _LOCK_TIMEOUT:
                 raise
             time.sleep(1.0)
 
@@ -181,7 +192,8 @@ def _deploy(test: Deployment) -> None:
     from codrl_mj.evaluation import evaluate
     from codrl_mj.runs.policies import load_policy
 
-    config = load_config(test.run, trust=True)  # ours: found by its configuration
+    # The folder is trusted: its name is the digest of a configuration that this process made.
+    config = load_config(test.run, trust=True)
     env = dataclasses.replace(test.env, **config.env.policy_fields)
     result = evaluate(load_policy(test.run), env, test.episodes, test.seed)
     write_json(test.record, result.as_mapping())

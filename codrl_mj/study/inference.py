@@ -1,8 +1,8 @@
-"""What may be concluded from scores of training runs: tests, corrections for their number, equivalence, power.
+"""Statistical inference on scores of training runs: tests, corrections, equivalence and power.
 
-A score is one trained policy's mean over its test episodes. Runs, not episodes, are what training
-repeats. A contrast pools strata (the same question on several tasks or doses): its effect is the
-mean of their differences of means.
+A score is the mean of one trained policy over its test episodes. The independent samples are runs,
+not episodes. A contrast pools strata (the same question on several tasks or severities): its effect
+is the mean of the strata's differences of means.
 """
 
 import bisect
@@ -14,38 +14,39 @@ import numpy as np
 
 from codrl_mj.evaluation.measures import Interval
 
-RELABELLINGS = 50_000
-"""Random relabellings of a permutation test: a p of 2e-5 is the smallest that it can give."""
+RELABELINGS = 50_000
+"""Random relabelings of a permutation test: the smallest possible p is 2e-5."""
 
 
 class Stratum(NamedTuple):
-    """Scores of two kinds of runs in the same test."""
+    """Scores of two groups of runs in the same test."""
 
-    one: np.ndarray
-    """Shape (n,), n >= 2."""
-    other: np.ndarray
-    """Shape (m,), m >= 2; of a paired stratum the same runs' in another test, in the same order."""
+    treatment: np.ndarray
+    """Scores that may be higher, shape (n,), n >= 2."""
+    control: np.ndarray
+    """Reference scores, shape (m,), m >= 2; if paired, those of the same runs in the same order."""
     paired: bool = False
-    """Whether both are the same runs'."""
+    """True if both groups are the same runs in two tests."""
 
     @property
     def difference(self) -> float:
-        """Mean of the one less mean of the other."""
-        return float(np.mean(self.one) - np.mean(self.other))
+        """Mean of the treatment minus mean of the control."""
+        return float(np.mean(self.treatment) - np.mean(self.control))
 
 
 def effect(strata: Sequence[Stratum], confidence: float = 0.95) -> Interval:
-    """Mean difference over the strata, with its interval by Student's t, variances unequal (Welch, Satterthwaite).
+    """Return the mean difference over strata with its interval by Welch's t (Satterthwaite).
 
     Args:
-        strata: at least one, of which none shares runs with another.
-        confidence: of the interval, in (0, 1).
+        strata: at least one; no two of them share runs.
+        confidence: confidence level of the interval, in (0, 1).
     """
-    from scipy.special import stdtrit  # Student's t without the distributions' half a second
+    # scipy.stats takes half a second to import; stdtrit is Student's quantile without it.
+    from scipy.special import stdtrit
 
     samples: list[np.ndarray] = []
-    for one, other, paired in strata:
-        samples += [one - other] if paired else [one, other]
+    for treatment, control, paired in strata:
+        samples += [treatment - control] if paired else [treatment, control]
     parts = [(float(np.var(sample, ddof=1)) / len(sample), len(sample) - 1) for sample in samples]
     variance = sum(part for part, _ in parts)
     mean = float(np.mean([stratum.difference for stratum in strata]))
@@ -56,62 +57,66 @@ def effect(strata: Sequence[Stratum], confidence: float = 0.95) -> Interval:
     return Interval(mean, mean - float(half), mean + float(half))
 
 
-def permutation_p(strata: Sequence[Stratum], least: float = 0.0, two_sided: bool = True) -> float:
-    """How often labels given at random make a mean difference as large as the one seen: the p of no difference.
+def permutation_p(
+    strata: Sequence[Stratum], min_difference: float = 0.0, two_sided: bool = True
+) -> float:
+    """Return the p of no difference, by a permutation test of the mean difference.
 
-    Labels are exchanged within each stratum: among its runs, or, where it is paired, within every
-    pair. The labels seen count as one of the relabellings. Where both kinds have the same
-    distribution (of pairs: where differences are as likely with either sign) the level is exact;
-    where their means alone are equal it is so approximately, for about equal numbers of runs.
+    Labels are exchanged within each stratum: among its runs, or within each pair of a paired
+    stratum. The observed labels count as one of the relabelings. The level is exact if both groups
+    have the same distribution (for pairs: if differences are symmetric about 0). If only the means
+    are equal, it is approximate and needs about equal numbers of runs.
 
     Args:
-        strata: at least one, of which none shares runs with another.
-        least: the difference that is to be exceeded: it is taken from the one's scores first.
-        two_sided: whether a difference of the other sign counts as well.
+        strata: at least one; no two of them share runs.
+        min_difference: difference to be exceeded; it is subtracted from the treatment's scores.
+        two_sided: True to count differences of either sign.
     """
-    totals = np.zeros(RELABELLINGS)
-    seen = 0.0
+    totals = np.zeros(RELABELINGS)
+    observed = 0.0
     for number, stratum in enumerate(strata):
-        one, other = stratum.one - least, stratum.other
-        seen += float(np.mean(one) - np.mean(other))
+        treatment, control = stratum.treatment - min_difference, stratum.control
+        observed += float(np.mean(treatment) - np.mean(control))
         if stratum.paired:
-            totals += _signs(len(one), number) @ (one - other) / len(one)
+            totals += _random_signs(len(treatment), number) @ (treatment - control) / len(treatment)
             continue
-        pooled, n = np.concatenate([one, other]), len(one)
-        sums = _chosen(n, len(other), number) @ pooled
-        totals += sums / n - (pooled.sum() - sums) / len(other)
-    slack = 1e-9 * max(1.0, abs(seen))  # sums in another order differ by rounding
-    extreme = np.abs(totals) >= abs(seen) - slack if two_sided else totals >= seen - slack
-    return (1 + int(extreme.sum())) / (1 + RELABELLINGS)
+        pooled, n = np.concatenate([treatment, control]), len(treatment)
+        sums = _random_labels(n, len(control), number) @ pooled
+        totals += sums / n - (pooled.sum() - sums) / len(control)
+    # Summation in another order changes the last bits, so ties are compared with a slack.
+    slack = 1e-9 * max(1.0, abs(observed))
+    extreme = np.abs(totals) >= abs(observed) - slack if two_sided else totals >= observed - slack
+    return (1 + int(extreme.sum())) / (1 + RELABELINGS)
 
 
 @functools.lru_cache(32)
-def _signs(n: int, stratum: int) -> np.ndarray:
-    """Random signs of n pairs, shape (relabellings, n)."""
+def _random_signs(n: int, stratum: int) -> np.ndarray:
+    """Return random signs of n pairs, shape (relabelings, n)."""
     random = np.random.default_rng([n, stratum])
-    return (random.integers(0, 2, (RELABELLINGS, n)) * 2 - 1).astype(np.float64)
+    return (random.integers(0, 2, (RELABELINGS, n)) * 2 - 1).astype(np.float64)
 
 
 @functools.lru_cache(32)
-def _chosen(n: int, m: int, stratum: int) -> np.ndarray:
-    """Which n of n + m runs are labelled as the one, at random, shape (relabellings, n + m)."""
-    keys = np.random.default_rng([n, m, stratum]).random((RELABELLINGS, n + m), dtype=np.float32)
+def _random_labels(n: int, m: int, stratum: int) -> np.ndarray:
+    """Return random masks of n treatment runs among n + m runs, shape (relabelings, n + m)."""
+    # The ranks of random keys are a random permutation; ranks below n select n runs of each row.
+    keys = np.random.default_rng([n, m, stratum]).random((RELABELINGS, n + m), dtype=np.float32)
     return (np.argsort(np.argsort(keys, axis=1), axis=1) < n).astype(np.float64)
 
 
 def equivalence_p(strata: Sequence[Stratum], margin: float) -> float:
-    """Two one-sided tests: the p of a difference of at least the margin, of either sign.
+    """Return the p of a difference of at least the margin, by two one-sided tests.
 
     Args:
         strata: at least one.
-        margin: largest difference that does not matter, > 0.
+        margin: largest difference that counts as equivalent, > 0.
     """
-    swapped = [Stratum(stratum.other, stratum.one, stratum.paired) for stratum in strata]
-    return max(permutation_p(of, -margin, two_sided=False) for of in (strata, swapped))
+    swapped = [Stratum(stratum.control, stratum.treatment, stratum.paired) for stratum in strata]
+    return max(permutation_p(pair, -margin, two_sided=False) for pair in (strata, swapped))
 
 
 def holm(p: Sequence[float]) -> np.ndarray:
-    """Holm's corrected p: the chance of any false positive among all of them stays below the level.
+    """Return p corrected by Holm, which bounds the probability of any false positive.
 
     Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of
     Statistics 6 (1979).
@@ -124,41 +129,48 @@ def holm(p: Sequence[float]) -> np.ndarray:
     return corrected
 
 
-def false_discovery(p: Sequence[float]) -> np.ndarray:
-    """Benjamini and Hochberg's corrected p (scipy): of what is called found, that share is false at most."""
+def benjamini_hochberg(p: Sequence[float]) -> np.ndarray:
+    """Return p corrected by Benjamini and Hochberg, which bounds the share of false discoveries."""
     from scipy.stats import false_discovery_control
 
     return np.asarray(false_discovery_control(p)) if len(p) else np.array([])
 
 
 def power(runs: int, difference: float, level: float = 0.05) -> float:
-    """Chance that a two-sided t-test of two kinds of at least 2 `runs` each finds a difference of their means.
+    """Return the power of a two-sided t-test of two groups, by the noncentral t distribution.
 
-    It is in standard deviations of a run. By the noncentral t distribution.
+    Args:
+        runs: runs in each group, >= 2.
+        difference: difference of the means [standard deviations of a run].
+        level: level of the test.
     """
     from scipy.stats import nct, t
 
     freedom, shift = 2 * runs - 2, difference * np.sqrt(runs / 2)
     bound = t.ppf(1 - level / 2, freedom)
     above, below = nct.sf(bound, freedom, shift), nct.cdf(-bound, freedom, shift)
-    return float(
-        np.nan_to_num(above, nan=1.0) + np.nan_to_num(below)
-    )  # scipy has NaN where nothing is left to find
+    # For large shifts scipy returns NaN instead of the limits 1 (above) and 0 (below).
+    return float(np.nan_to_num(above, nan=1.0) + np.nan_to_num(below))
 
 
-def detectable(runs: int, level: float = 0.05, chance: float = 0.8) -> float:
-    """Smallest difference, in standard deviations of a run, that is found with that chance."""
+def detectable_difference(runs: int, level: float = 0.05, probability: float = 0.8) -> float:
+    """Return the smallest difference [standard deviations of a run] detected with a probability."""
     from scipy.optimize import brentq
 
-    return float(brentq(lambda difference: power(runs, difference, level) - chance, 1e-6, 50.0))
+    return float(
+        brentq(lambda difference: power(runs, difference, level) - probability, 1e-6, 50.0)
+    )
 
 
 def runs_needed(
-    difference: float, level: float = 0.05, chance: float = 0.8, most: int = 10_000
+    difference: float, level: float = 0.05, probability: float = 0.8, max_runs: int = 10_000
 ) -> int | None:
-    """Runs of each kind that find a difference, in standard deviations of a run, with that chance; None: > `most`."""
-    if difference == 0 or power(most, difference, level) < chance:
+    """Return the runs per group that detect a difference; None if more than `max_runs`.
+
+    The difference is in standard deviations of a run.
+    """
+    if difference == 0 or power(max_runs, difference, level) < probability:
         return None
     return bisect.bisect_left(
-        range(most), chance, 2, key=lambda runs: power(runs, difference, level)
+        range(max_runs), probability, 2, key=lambda runs: power(runs, difference, level)
     )

@@ -1,4 +1,4 @@
-"""Calls computed many at once, in processes of this machine or on a Ray cluster; nothing else here starts processes."""
+"""Parallel calls in processes of this machine or on a Ray cluster."""
 
 import contextlib
 import dataclasses
@@ -18,18 +18,18 @@ from codrl_mj.training.run import collecting_signals
 
 @dataclasses.dataclass(frozen=True)
 class Workers(Checked):
-    """What computes the calls.
+    """Settings of the processes that compute.
 
     Raises:
         ValueError: unknown backend, or an impossible number of jobs.
     """
 
     jobs: int = -1
-    """Calls at once, >= 1; -1 for one on each CPU (of the cluster)."""
+    """Number of parallel calls, >= 1; -1 for one on each CPU (of the cluster)."""
     backend: Literal["local", "ray"] = choice("local", "local", "ray")
-    """`local`: processes of this machine; `ray`: a Ray cluster, whose machines all see the run folders."""
+    """`local`: processes of this machine; `ray`: a Ray cluster with a shared file system."""
     address: str | None = None
-    """Of the Ray cluster, such as `auto` or `ray://head:10001`; None starts Ray on this machine."""
+    """Address of the Ray cluster (`auto`, `ray://head:10001`); None starts Ray on this machine."""
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -45,18 +45,26 @@ class Workers(Checked):
 
     @property
     def cores(self) -> int:
-        """Processors of this machine that so many jobs use."""
+        """Number of this machine's CPUs that the jobs use."""
         return (os.cpu_count() or 1) if self.jobs == -1 else self.jobs
 
 
 def compute(
     function: Callable[..., Any], work: Iterable[tuple[Any, ...]], workers: Workers
 ) -> Iterator[Any]:
-    """Results of calls, all of it picklable, as they come; those of a Ray cluster when all are there.
+    """Yield the results of calls in the order of completion; with Ray, after the last has finished.
 
-    After a Ctrl-C no call is begun any more, trainings write their checkpoints, and other calls
-    end; a second one stops at once. What a call raises breaks the others off. Processes end with
-    this one, however it ends.
+    After Ctrl-C no further call starts, trainings write their checkpoints, and other calls run to
+    their end; a second Ctrl-C stops at once. An exception in a call aborts the others. The worker
+    processes end with this process, even if it is killed.
+
+    Args:
+        function: picklable function.
+        work: picklable arguments of each call.
+        workers: processes that compute.
+
+    Raises:
+        TrainingStoppedError: a signal asked to stop.
     """
     calls = list(work)
     if not calls:
@@ -64,10 +72,12 @@ def compute(
     import joblib
 
     local = workers.backend == "local"
-    none: list[int] = []
+    no_signals: list[int] = []
     with (
         _backend(workers) as backend,
-        collecting_signals(signal.SIGINT) if local else contextlib.nullcontext(none) as asked,
+        collecting_signals(signal.SIGINT)
+        if local
+        else contextlib.nullcontext(no_signals) as stop_signals,
     ):
         parallel = joblib.Parallel(
             n_jobs=workers.jobs,
@@ -76,28 +86,28 @@ def compute(
             pre_dispatch="n_jobs",
             return_as="generator_unordered" if local else "list",
         )
-        call = joblib.delayed(_call)
+        delayed_call = joblib.delayed(_call)
         parent = os.getpid() if local else None
-        begun = itertools.takewhile(lambda _: not asked, calls)
+        pending = itertools.takewhile(lambda _: not stop_signals, calls)
         for result, stopped_by in parallel(
-            call(function, arguments, parent) for arguments in begun
+            delayed_call(function, arguments, parent) for arguments in pending
         ):
             if stopped_by is None:
                 yield result
             else:
-                asked.append(stopped_by)
-        if asked:
+                stop_signals.append(stopped_by)
+        if stop_signals:
             raise TrainingStoppedError(
-                "stopped: the same command goes on from the last checkpoints", asked[0]
+                "stopped: the same command goes on from the last checkpoints", stop_signals[0]
             )
 
 
 def _call(
     function: Callable[..., Any], arguments: tuple[Any, ...], parent: int | None
 ) -> tuple[Any, int | None]:
-    """The result, and the signal that stopped it."""
+    """Call a function; return its result and the signal that stopped it, if any."""
     if parent is not None and os.getpid() != parent:
-        _serve(parent)
+        _die_with_parent(parent)
     try:
         return function(*arguments), None
     except TrainingStoppedError as stopped:
@@ -105,8 +115,9 @@ def _call(
 
 
 @functools.cache
-def _serve(parent: int) -> None:
-    """Have this process end when its parent does, even if that is killed, and leave Ctrl-C to it and to trainings."""
+def _die_with_parent(parent: int) -> None:
+    """Make this process end with its parent, even if that is killed, and ignore Ctrl-C."""
+    # Ctrl-C reaches all processes of the terminal. The parent handles it and tells the trainings.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
@@ -119,7 +130,7 @@ def _serve(parent: int) -> None:
 
 @contextlib.contextmanager
 def _backend(workers: Workers) -> Iterator[str]:
-    """The name in joblib of the backend, which is up while the block runs."""
+    """Start the backend for the duration of the block and yield its name in joblib."""
     if workers.backend == "local":
         yield "loky"
         return
@@ -130,12 +141,12 @@ def _backend(workers: Workers) -> Iterator[str]:
         raise ValueError(
             "backend = 'ray': Ray is not installed: pip install 'codrl-mj[ray]'"
         ) from None
-    ours = not ray.is_initialized()
-    if ours:
+    started_here = not ray.is_initialized()
+    if started_here:
         ray.init(address=workers.address, log_to_driver=False)
     register_ray()
     try:
         yield "ray"
     finally:
-        if ours:
+        if started_here:
             ray.shutdown()

@@ -1,4 +1,4 @@
-"""What a study's script is: flags, progress, costs, and a page of what there is: docs/studies.md."""
+"""Base class of a study's script: flags, progress, costs and the result page; docs/studies.md."""
 
 import abc
 import dataclasses
@@ -21,13 +21,13 @@ from rich.table import Table
 from codrl_mj.fields import Checked, integer
 from codrl_mj.runs.files import check_writable
 from codrl_mj.study.parallel import Workers
-from codrl_mj.study.trials import Grid, numbers_as_text
+from codrl_mj.study.trials import Grid, format_ranges
 from codrl_mj.training import TrainingStoppedError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Program(Checked, abc.ABC):
-    """A script that trains and tests much, unless that is done already, and writes a page of it.
+    """Script that computes the missing trainings and tests of a study and writes its page.
 
     Raises:
         ValueError: a number that is out of its bounds.
@@ -37,29 +37,29 @@ class Program(Checked, abc.ABC):
     """Folder of the run folders."""
     out: Path = Path("docs/results")
     """Folder for the page, its figures and its tables."""
-    seeds: int = integer(5, least=1)
+    seeds: int = integer(5, minimum=1)
     """Training runs of each kind, with seeds from 0."""
     workers: tyro.conf.OmitArgPrefixes[Workers] = Workers()
     accept_changes: bool = False
-    """Continue begun trainings even if the code or a package is no longer the one that they were started with."""
+    """Continue started trainings even if the code or a package has changed since."""
     dry_run: bool = False
-    """Only list the trainings, which of them are finished, and what the rest would take."""
+    """Only list the trainings, the finished ones, and the estimated time of the rest."""
     only_page: bool = False
-    """Only write the page, of what there is."""
+    """Only write the page from the available results."""
 
     @property
     @abc.abstractmethod
     def grid(self) -> Grid:
-        """Its trainings and tests."""
+        """Trainings and tests of the study."""
 
     @abc.abstractmethod
     def write(self) -> tuple[Iterable[Path], Mapping[str, str]]:
-        """Write the page of all results that there are: the files, and what failed."""
+        """Write the page of all available results; return the files and the errors by name."""
 
     def publish(self) -> None:
-        """Write what there is, each time that all of a seed is computed: run folders do not outlive a machine.
+        """Write the available results after each completed seed: run folders may be temporary.
 
-        What cannot be written now is written in the end, or refused there.
+        An error is only printed: the page is written again at the end, and raises it there.
         """
         try:
             self.write()
@@ -67,19 +67,20 @@ class Program(Checked, abc.ABC):
             print(f"not published yet: {error}", file=sys.stderr)
 
     def run(self) -> int:
-        """Compute what is missing and write the page; 1 if something failed."""
+        """Compute missing results and write the page; return 1 if anything failed."""
         grid, workers = self.grid, self.workers
         if self.dry_run:
-            left = _print_costs(grid)
+            core_hours = _print_costs(grid)
             print(
-                f"about {left:.2f} core hours are left: {left / workers.cores:.2f} hours with"
-                f" {workers.cores} jobs"
+                f"about {core_hours:.2f} core hours are left:"
+                f" {core_hours / workers.cores:.2f} hours with {workers.cores} jobs"
             )
             return 0
         check_writable(self.root)
         check_writable(self.out)
         if not self.only_page:
-            import matplotlib  # noqa: F401 - what is missing is missed now and not in the end
+            # A missing package is reported before hours of work, not after.
+            import matplotlib  # noqa: F401
 
             compute(grid, workers, self.accept_changes, self.publish)
         files, failures = self.write()
@@ -91,11 +92,11 @@ class Program(Checked, abc.ABC):
 
 
 def main(kind: type[Program], arguments: Sequence[str] | None = None) -> int:
-    """Run a study's script; its flags are the fields of its program.
+    """Run a study's script, with the fields of its program as flags.
 
     Args:
         kind: the program.
-        arguments: the command line without the script's name; None takes the process's.
+        arguments: command line without the script's name; None takes `sys.argv`.
 
     Returns:
         Exit status: 0, 1 if something failed, 2 for bad input, 130 after Ctrl-C, 143 after SIGTERM.
@@ -116,7 +117,7 @@ def compute(
     accept_changes: bool = False,
     on_seed: Callable[[], None] = lambda: None,
 ) -> None:
-    """Compute what of a grid is missing, with a progress bar each for its trainings and its tests."""
+    """Compute the missing cells of a grid, with progress bars for trainings and tests."""
     counts = {"training": len(grid.cells), "test": len(grid.deployments)}
     columns = (
         TextColumn("{task.description}"),
@@ -130,18 +131,24 @@ def compute(
 
 
 def _print_costs(grid: Grid) -> float:
-    """Print every arm, which of its trainings are finished, and what is left; the core hours left."""
-    table, every = Table("arm", "seeds\nfinished", "seeds\nto do", box=None), grid.costs()
+    """Print finished and missing trainings of every arm; return the remaining core hours."""
+    table, costs = Table("arm", "seeds\nfinished", "seeds\nto do", box=None), grid.costs()
     for column in ("s each", "tests\nto do", "core hours\nleft"):
         table.add_column(column, justify="right")
-    for cost in every:
-        each = f"{'' if cost.finished else 'about '}{cost.seconds:.0f}"
-        seeds = numbers_as_text(cost.finished), numbers_as_text(cost.missing)
-        table.add_row(cost.arm.name, *seeds, each, str(cost.tests), f"{cost.left / 3600:.2f}")
+    for cost in costs:
+        seconds_each = f"{'' if cost.finished else 'about '}{cost.seconds:.0f}"
+        seeds = format_ranges(cost.finished), format_ranges(cost.missing)
+        table.add_row(
+            cost.arm.name,
+            *seeds,
+            seconds_each,
+            str(cost.tests),
+            f"{cost.remaining_seconds / 3600:.2f}",
+        )
     _console().print(table)
-    return sum(cost.left for cost in every) / 3600
+    return sum(cost.remaining_seconds for cost in costs) / 3600
 
 
 def _console() -> Console:
-    """110 columns wide where it goes to a file."""
+    """Return a console that is 110 columns wide if the output is not a terminal."""
     return Console() if sys.stdout.isatty() else Console(width=110)

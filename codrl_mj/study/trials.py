@@ -1,9 +1,9 @@
-"""What studies consist of: arms that are trained with many seeds, and trials that test their policies.
+"""Elements of a study: arms that are trained with many seeds, and trials that test their policies.
 
-A study is its trials. Every training is a run folder that is found again by its configuration,
-every test of a policy a file in it; so whatever is there is never computed again, whoever computed
-it. Run folders do not outlive a machine: a row of every test, with the name of its run, is
-published, and stands for a run folder that is not at hand.
+A study is defined by its trials. Every training is a run folder named by its configuration, and
+every test is a file in it, so available results are never computed twice. Run folders may be
+temporary: a row of every test, with the name of its run, is published and replaces a run folder
+that is no longer available.
 """
 
 import collections
@@ -26,11 +26,11 @@ from codrl_mj.training import EVALUATION_SEED, TrainConfig, finished
 from codrl_mj.training.folder import RESULT
 
 TEST_SECONDS = 1.0
-"""What a test takes [s of one core], about."""
-FAILED = 0.1
-"""A policy that scores less than one by more than this has failed."""
+"""Approximate time of a test [s of one core]."""
+FAILURE_MARGIN = 0.1
+"""A policy has failed if its score is below 1 by more than this."""
 RUNS, TOTALS = "runs.csv", "totals.json"
-"""What is published of a study: a row for every policy and test; what its trainings took in all."""
+"""Published files of a study: a row for every policy and test; totals of its trainings."""
 MEASURES = (
     "success",
     "tracking_percent",
@@ -43,19 +43,19 @@ MEASURES = (
     "torque_rms",
     "reversals",
 )
-"""What is published of a test besides its return: fields of `codrl_mj.evaluation.Evaluation`."""
+"""Published measures of a test besides its return: fields of `codrl_mj.evaluation.Evaluation`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Arm:
-    """A way to train, to be repeated with every seed."""
+    """Training configuration that is repeated with every seed."""
 
     name: str
-    """A name that no other arm of the study has."""
+    """Unique name within the study."""
     config: TrainConfig
-    """The training with seed 0; others differ by the seed alone."""
+    """Training with seed 0; the others differ only in the seed."""
     seconds: float
-    """What a training takes [s of one core], about; where some are finished, they are gone by."""
+    """Estimated time of a training [s of one core]; replaced by the mean of finished ones."""
 
     @property
     def task(self) -> str:
@@ -63,58 +63,58 @@ class Arm:
         return self.config.task
 
     def training(self, seed: int) -> TrainConfig:
-        """The training with a seed."""
+        """Return the training configuration with a seed."""
         return dataclasses.replace(self.config, seed=seed)
 
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """The policies of an arm, tested."""
+    """Test of all policies of an arm."""
 
     arm: Arm
-    """How they were trained."""
+    """Arm that trained the policies."""
     test: str
-    """What they are tested on: a name that no other test of the task has."""
+    """Name of the test, unique within the task."""
     env: EnvConfig
-    """The same, complete but for actions and observations, which are those of the training."""
+    """Environment of the test, except actions and observations, which are those of the training."""
 
     @property
     def name(self) -> str:
-        """What sets it apart from all others."""
+        """Unique name of the trial."""
         return f"{self.arm.name} on {self.test}"
 
 
 class Cost(NamedTuple):
-    """What an arm takes."""
+    """Computing time of an arm."""
 
     arm: Arm
     """The arm."""
     finished: tuple[int, ...]
     """Seeds whose training is finished."""
     missing: tuple[int, ...]
-    """Seeds whose training is not."""
+    """Seeds whose training is not finished."""
     seconds: float
-    """A training's computing time [s of one core]: the mean of the finished ones, or an estimate."""
+    """Time of a training [s of one core]: mean of the finished ones, or an estimate."""
     tests: int
-    """Tests of its policies that are not there."""
+    """Number of missing tests."""
 
     @property
-    def left(self) -> float:
-        """What is missing takes [s of one core]."""
+    def remaining_seconds(self) -> float:
+        """Estimated time of the missing trainings and tests [s of one core]."""
         return len(self.missing) * self.seconds + self.tests * TEST_SECONDS
 
 
 class Totals(NamedTuple):
-    """What the trainings of a study took."""
+    """Totals of a study's trainings."""
 
     trainings: int
-    """Finished ones."""
+    """Number of finished trainings."""
     missing: int
-    """Trainings and tests that are not there."""
+    """Number of missing trainings and tests."""
     seconds: float
-    """What the finished ones took, each on one core [s]."""
+    """Total time of the finished trainings [s of one core]."""
     codes: Mapping[str, int]
-    """How many of them each version of the code has trained, by its digest."""
+    """Digest of a code version -> number of trainings with it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,50 +128,52 @@ class Grid:
     root: Path
     """Folder of the run folders."""
     trials: tuple[Trial, ...]
-    """Every trial once."""
+    """All trials, without duplicates."""
     seeds_of: Callable[[Arm], range]
-    """The seeds of an arm."""
+    """Function arm -> seeds."""
     episodes: int = 100
     """Test episodes of every policy, >= 1."""
     published: Path | None = None
-    """Folder of the published rows, which stand for run folders that are not at hand."""
+    """Folder of the published rows, which replace run folders that are not available."""
 
     def __post_init__(self) -> None:
         """Validate."""
-        for kind, named in (
+        for kind, definitions in (
             ("arm", {(trial.arm.name, repr(trial.arm.config)) for trial in self.trials}),
             ("trial", {(trial.name, repr(trial.env)) for trial in self.trials}),
         ):
-            twice = [
+            duplicates = [
                 name
-                for name, count in collections.Counter(name for name, _ in named).items()
+                for name, count in collections.Counter(name for name, _ in definitions).items()
                 if count > 1
             ]
-            if twice:
+            if duplicates:
                 raise ValueError(
-                    f"{kind} {twice[0]!r}: stands for several: give each a name of its own"
+                    f"{kind} {duplicates[0]!r}: names several: give each a different name"
                 )
 
     @functools.cached_property
     def arms(self) -> tuple[Arm, ...]:
-        """Every arm once."""
+        """All arms, without duplicates."""
         return tuple({trial.arm.name: trial.arm for trial in self.trials}.values())
 
     @functools.cached_property
     def cells(self) -> dict[tuple[str, int], TrainConfig]:
-        """The trainings by arm and seed: first seeds first, so that a part says something of all; the longest first."""
-        every = [(arm, seed) for arm in self.arms for seed in self.seeds_of(arm)]
-        every.sort(key=lambda cell: (cell[1], -cell[0].seconds))
-        return {(arm.name, seed): arm.training(seed) for arm, seed in every}
+        """Trainings by arm and seed, sorted by seed and then by descending time."""
+        # Low seeds first: an interrupted study then has results of every arm. Long trainings first
+        # within a seed: the workers finish at about the same time.
+        all_cells = [(arm, seed) for arm in self.arms for seed in self.seeds_of(arm)]
+        all_cells.sort(key=lambda cell: (cell[1], -cell[0].seconds))
+        return {(arm.name, seed): arm.training(seed) for arm, seed in all_cells}
 
     @functools.cached_property
     def folders(self) -> dict[tuple[str, int], Path]:
-        """The run folders by arm and seed."""
+        """Run folders by arm and seed."""
         return {cell: cell_folder(self.root, config) for cell, config in self.cells.items()}
 
     @functools.cached_property
     def deployments(self) -> dict[tuple[str, int], Deployment]:
-        """The tests by trial and seed, whether the policies are trained or not."""
+        """Tests by trial and seed, including those of policies that are not trained yet."""
         folders = self.folders
         return {
             (trial.name, seed): Deployment(
@@ -182,24 +184,24 @@ class Grid:
         }
 
     @functools.cached_property
-    def rows(self) -> dict[tuple[str, int], dict[str, float | None]]:
-        """Published measures of tests of these very trainings, by trial and seed."""
-        tests, found = self.deployments, {}
+    def published_rows(self) -> dict[tuple[str, int], dict[str, float | None]]:
+        """Published measures by trial and seed, of tests whose run has the same configuration."""
+        tests, rows = self.deployments, {}
         for row in [] if self.published is None else read_csv(self.published / RUNS):
             key = f"{row['task']}: {row['trained']} on {row['tested']}", int(row["seed"])
             if key in tests and tests[key].run.name == row["run"]:
-                found[key] = {
+                rows[key] = {
                     name: float(row[name]) if row[name] else None for name in ("returns", *MEASURES)
                 }
-        return found
+        return rows
 
     def _untested(self) -> dict[tuple[str, int], Deployment]:
-        """The tests of which there is neither a file nor a row."""
+        """Return the tests that have neither a file nor a published row."""
         tests = self.deployments
         return {
             key: test
             for key, test in tests.items()
-            if key not in self.rows and not test.record.is_file()
+            if key not in self.published_rows and not test.record.is_file()
         }
 
     def compute(
@@ -209,173 +211,199 @@ class Grid:
         on_cell: Callable[[str], None] = lambda _: None,
         on_seed: Callable[[], None] = lambda: None,
     ) -> None:
-        """Train and test what is missing. What fails is recorded in `root/failures` and stops nothing else.
+        """Compute missing trainings and tests; failures are recorded in `root/failures`.
 
         Args:
-            workers: what computes it.
-            accept_changes: continue begun trainings even if code or packages have changed since.
-            on_cell: called with `training` or `test` when one is finished or has failed.
-            on_seed: called when all of a seed's are, or of the fewest seeds that occupy every core,
-                unless nothing came of it.
+            workers: processes that compute.
+            accept_changes: continue started trainings even if code or packages have changed.
+            on_cell: called with `training` or `test` when one has finished or failed.
+            on_seed: called after each group of seeds (one seed, or as many as occupy every core)
+                that produced a result.
 
         Raises:
-            ValueError: Ray is asked for and not installed.
+            ValueError: the backend is Ray, which is not installed.
             TrainingStoppedError: a signal asked to stop.
         """
         cells, folders, tests = self.cells, self.folders, self._untested()
         needed = {test.run for test in tests.values()}
-        left = [
+        missing_seeds = [
             cell[1] for cell, folder in folders.items() if folder in needed and not finished(folder)
         ]
         rounds: list[list[int]] = [[]]
-        for seed in sorted(
-            {seed for _, seed in cells}
-        ):  # trained and tested, so that a part says something of all
+        # Seeds are trained and tested in groups, so that an interrupted study has complete seeds.
+        for seed in sorted({seed for _, seed in cells}):
             rounds[-1].append(seed)
-            if sum(map(left.count, rounds[-1])) >= workers.cores:
+            if sum(map(missing_seeds.count, rounds[-1])) >= workers.cores:
                 rounds.append([])
         for seeds in filter(None, rounds):
             runs = {folders[cell]: config for cell, config in cells.items() if cell[1] in seeds}
             for _ in set(runs) - needed:
                 on_cell("training")
-            waiting = {folder: config for folder, config in runs.items() if folder in needed}
+            unfinished = {folder: config for folder, config in runs.items() if folder in needed}
             train_runs(
-                waiting,
+                unfinished,
                 workers,
                 lambda _: on_cell("training"),
                 accept_changes=accept_changes,
                 tensorboard=False,
             )
             ready = {
-                called(*key): test
+                cell_name(*key): test
                 for key, test in tests.items()
                 if key[1] in seeds and finished(test.run)
             }
             deploy_cells(ready, workers, lambda _: on_cell("test"))
-            if any(map(finished, waiting)) or any(test.record.is_file() for test in ready.values()):
+            if any(map(finished, unfinished)) or any(
+                test.record.is_file() for test in ready.values()
+            ):
                 on_seed()
 
     def collect(self) -> "Collected":
-        """All that is there, without computing anything.
+        """Return the available results, without computing anything.
 
         Raises:
             ValueError: a file of a run is damaged.
         """
         folders, tests = self.folders, self.deployments
-        at_hand = {cell: folder for cell, folder in folders.items() if finished(folder)}
+        local_folders = {cell: folder for cell, folder in folders.items() if finished(folder)}
         arm_of = {trial.name: trial.arm.name for trial in self.trials}
-        done = at_hand | {
-            cell: folders[cell] for trial, seed in self.rows if (cell := (arm_of[trial], seed))
+        finished_cells = local_folders | {
+            cell: folders[cell]
+            for trial, seed in self.published_rows
+            if (cell := (arm_of[trial], seed))
         }
         evaluations: dict[str, dict[int, Mapping[str, Any]]] = {
             trial.name: {} for trial in self.trials
         }
         missing: dict[str, Path | Deployment] = {
-            called(*cell): folder for cell, folder in folders.items() if cell not in done
+            cell_name(*cell): folder
+            for cell, folder in folders.items()
+            if cell not in finished_cells
         }
         for (trial, seed), test in tests.items():
             if test.record.is_file():
                 evaluations[trial][seed] = read_json(test.record, "evaluation")
-            elif (trial, seed) in self.rows:
-                evaluations[trial][seed] = self.rows[trial, seed]
+            elif (trial, seed) in self.published_rows:
+                evaluations[trial][seed] = self.published_rows[trial, seed]
             elif finished(test.run):
-                missing[called(trial, seed)] = test
+                missing[cell_name(trial, seed)] = test
         failures = {name: read_failure(cell) for name, cell in missing.items()}
         return Collected(
             grid=self,
-            folders={cell: done[cell] for cell in folders if cell in done},
+            folders={cell: finished_cells[cell] for cell in folders if cell in finished_cells},
             evaluations=evaluations,
             missing=tuple(missing),
             failures={name: failure for name, failure in failures.items() if failure is not None},
-            totals=self._totals(at_hand, len(done), len(missing)),
+            totals=self._totals(local_folders, len(finished_cells), len(missing)),
         )
 
-    def _totals(self, at_hand: Mapping[tuple[str, int], Path], done: int, missing: int) -> "Totals":
-        """What trainings took: those at hand with tests, which get rows, beside what is published of all that have."""
-        tests, before, file = (
+    def _totals(
+        self, local_folders: Mapping[tuple[str, int], Path], finished_count: int, missing: int
+    ) -> "Totals":
+        """Add the time of newly tested trainings to the published totals."""
+        tests, published_totals, file = (
             self.deployments,
             Totals(0, 0, 0.0, {}),
             (self.published or self.root) / TOTALS,
         )
-        have_rows = {tests[key].run for key in self.rows}
+        published_runs = {tests[key].run for key in self.published_rows}
         tested = {test.run for test in tests.values() if test.record.is_file()}
-        if self.rows and file.is_file() and len(read_csv(file.with_name(RUNS))) == len(self.rows):
-            before = Totals(**read_json(file, "totals of a study"))
-        new = [
-            one
-            for one in at_hand.values()
-            if one in tested and not (before.trainings and one in have_rows)
+        if (
+            self.published_rows
+            and file.is_file()
+            and len(read_csv(file.with_name(RUNS))) == len(self.published_rows)
+        ):
+            published_totals = Totals(**read_json(file, "totals of a study"))
+        new_folders = [
+            folder
+            for folder in local_folders.values()
+            if folder in tested and not (published_totals.trainings and folder in published_runs)
         ]
-        if before.trainings and not new:
-            return before
+        if published_totals.trainings and not new_folders:
+            return published_totals
         codes = [
             str(read_json(folder / "config.json", "run configuration").get("code"))[:8]
-            for folder in new
+            for folder in new_folders
         ]
-        seconds = before.seconds + sum(training_seconds(folder) for folder in new)
+        seconds = published_totals.seconds + sum(training_seconds(folder) for folder in new_folders)
         return Totals(
-            done,
+            finished_count,
             missing,
             seconds,
-            dict(collections.Counter(before.codes) + collections.Counter(codes)),
+            dict(collections.Counter(published_totals.codes) + collections.Counter(codes)),
         )
 
     def costs(self) -> list[Cost]:
-        """What every arm takes.
+        """Return the computing time of every arm.
 
         Raises:
             ValueError: a file of a finished run is damaged.
         """
         folders = self.folders
         untested = collections.Counter(test.run for test in self._untested().values())
-        found = []
+        costs = []
         for arm in self.arms:
-            mine = {seed: folders[arm.name, seed] for seed in self.seeds_of(arm)}
-            took = {
-                seed: training_seconds(folder) for seed, folder in mine.items() if finished(folder)
+            arm_folders = {seed: folders[arm.name, seed] for seed in self.seeds_of(arm)}
+            measured_seconds = {
+                seed: training_seconds(folder)
+                for seed, folder in arm_folders.items()
+                if finished(folder)
             }
-            seconds = float(np.mean(list(took.values()))) if took else arm.seconds
-            waiting = sum(untested[folder] for folder in mine.values())
-            done = tuple(
-                seed for seed, folder in mine.items() if seed in took or not untested[folder]
+            seconds = (
+                float(np.mean(list(measured_seconds.values()))) if measured_seconds else arm.seconds
             )
-            found.append(
-                Cost(arm, done, tuple(seed for seed in mine if seed not in done), seconds, waiting)
+            missing_tests = sum(untested[folder] for folder in arm_folders.values())
+            finished_seeds = tuple(
+                seed
+                for seed, folder in arm_folders.items()
+                if seed in measured_seconds or not untested[folder]
             )
-        return found
+            costs.append(
+                Cost(
+                    arm,
+                    finished_seeds,
+                    tuple(seed for seed in arm_folders if seed not in finished_seeds),
+                    seconds,
+                    missing_tests,
+                )
+            )
+        return costs
 
 
 @dataclasses.dataclass(frozen=True)
 class Collected:
-    """All that is computed so far."""
+    """Available results of a grid."""
 
     grid: Grid
-    """What was asked for."""
+    """The grid."""
     folders: Mapping[tuple[str, int], Path]
     """Run folders of the finished trainings, by arm and seed."""
     evaluations: Mapping[str, Mapping[int, Mapping[str, Any]]]
-    """`Evaluation.as_mapping()` by trial and seed; those that are missing are left out."""
+    """`Evaluation.as_mapping()` by trial and seed, without missing ones."""
     missing: tuple[str, ...]
-    """Trainings that are not finished, and tests of finished ones that are not there, by name."""
+    """Names of unfinished trainings, and of missing tests of finished ones."""
     failures: Mapping[str, str]
-    """What went wrong, by the names of those of them that were tried."""
+    """Name -> error, for those in `missing` that have failed."""
     totals: Totals
-    """What they took."""
+    """Totals of the trainings."""
 
     def scores(self, trial: Trial, measure: str = "returns") -> dict[int, float]:
-        """A measure of every policy of a trial that has one, by seed: means of intervals, medians of quartiles.
+        """Return a measure of a trial's policies by seed: means of intervals, medians of quartiles.
 
-        None of a trial that is not in the grid.
+        Policies without a value are left out. A trial outside the grid has no values.
         """
         tested = self.evaluations.get(trial.name, {})
-        found = {seed: plain(evaluation[measure]) for seed, evaluation in tested.items()}
-        return {seed: float(value) for seed, value in found.items() if value is not None}
+        values = {seed: to_scalar(evaluation[measure]) for seed, evaluation in tested.items()}
+        return {seed: float(value) for seed, value in values.items() if value is not None}
 
 
 def run_rows(
     collected: Collected, score: Callable[[Trial], Mapping[int, float]]
 ) -> Iterable[dict[str, Any]]:
-    """A row for every policy and test, units as in docs/evaluation.md; `score` gives those of a trial by seed."""
+    """Yield a row for every policy and test; `score` returns a trial's scores by seed.
+
+    The units are those of docs/evaluation.md.
+    """
     for trial in collected.grid.trials:
         scores = score(trial)
         measured = {name: collected.scores(trial, name) for name in ("returns", *MEASURES)}
@@ -386,7 +414,7 @@ def run_rows(
                 "tested": trial.test,
                 "seed": seed,
                 "score": scores.get(seed),
-                **{name: found.get(seed) for name, found in measured.items()},
+                **{name: values.get(seed) for name, values in measured.items()},
                 "run": collected.folders[trial.arm.name, seed].name,
             }
 
@@ -394,7 +422,7 @@ def run_rows(
 def trial_rows(
     collected: Collected, score: Callable[[Trial], Mapping[int, float]]
 ) -> Iterable[dict[str, Any]]:
-    """A row for every trial: mean score with its 95 % bootstrap interval over policies, and means of the measures."""
+    """Yield a row for every trial: mean score with bootstrap interval, means of the measures."""
     for trial in collected.grid.trials:
         scores = np.array(list(score(trial).values()))
         if not scores.size:
@@ -413,33 +441,33 @@ def trial_rows(
             "low": mean.low,
             "high": mean.high,
             "median": np.median(scores),
-            "failed": np.mean(scores < 1.0 - FAILED),
+            "failed": np.mean(scores < 1.0 - FAILURE_MARGIN),
             "worst": scores.min(),
             "best": scores.max(),
-            **{name: np.mean(found) if found else None for name, found in measured.items()},
+            **{name: np.mean(values) if values else None for name, values in measured.items()},
             "actuator": mapping_of(env.actuators[0]) or "ideal",
             "joint": env.joint.friction,
             "command_delay": env.disturbances.command_delay,
         }
 
 
-def called(name: str, seed: int) -> str:
-    """What a cell is called."""
+def cell_name(name: str, seed: int) -> str:
+    """Return the name of a cell."""
     return f"{name}, seed {seed}"
 
 
-def plain(value: Any) -> Any:
-    """A measure as one number: of an interval the mean, of quartiles the median."""
+def to_scalar(value: Any) -> Any:
+    """Return a measure as a number: the mean of an interval, the median of quartiles."""
     return value.get("mean", value.get("median")) if isinstance(value, Mapping) else value
 
 
 def training_seconds(folder: Path) -> float:
-    """What a finished training took [s]."""
+    """Return the time of a finished training [s]."""
     return float(read_json(folder / RESULT, "result of a run")["seconds"])
 
 
-def numbers_as_text(numbers: Sequence[int]) -> str:
-    """Numbers as text: runs of consecutive ones by their ends."""
+def format_ranges(numbers: Sequence[int]) -> str:
+    """Return integers as text, with consecutive ones as ranges."""
     parts: list[list[int]] = []
     for number in sorted(numbers):
         if parts and number == parts[-1][1] + 1:

@@ -60,13 +60,13 @@ class Task(fields.Checked):
     """Name on the command line, such as `cartpole`."""
     env_id: str
     """Id in Gymnasium's registry, such as `codrl_mj/CartPole-v0`."""
-    max_episode_steps: int | None = field(metadata=fields.integer(None, least=1).metadata)
+    max_episode_steps: int | None = field(metadata=fields.integer(None, minimum=1).metadata)
     """Time limit [environment steps]; None for none."""
     asset: str
     """MJCF file: the name of one in the package, or a path."""
     step_duration: float = field(metadata=fields.real(1.0, above=0.0, unit="s").metadata)
     """Duration of one environment step [s]."""
-    motor_inner_steps: int = field(metadata=fields.integer(1, least=1).metadata)
+    motor_inner_steps: int = field(metadata=fields.integer(1, minimum=1).metadata)
     """Integration steps per environment step when a motor is in the loop."""
     max_force: Any
     """Largest desired force [N] or torque [N*m] of any action. If the action is the force, it is
@@ -106,7 +106,7 @@ class Task(fields.Checked):
     An episode succeeds if it ends at the goal and has been there for `goal_hold`. None if the goal
     is to survive: an episode then succeeds if it is not terminated before the time limit.
     """
-    goal_hold: float = fields.real(0.0, least=0.0, unit="s")
+    goal_hold: float = fields.real(0.0, minimum=0.0, unit="s")
     """Time at the goal [s], up to its end, that an episode needs for success."""
 
     forces: tuple[Any, ...] | None = None
@@ -129,7 +129,7 @@ class Task(fields.Checked):
     """
     observation_space: spaces.Box = None  # type: ignore[assignment]
     """Observation space, as in Gymnasium; by default without bounds."""
-    render_fps: int = fields.integer(0, least=0)
+    render_fps: int = fields.integer(0, minimum=0)
     """Frames per second of a video with one frame a step; by default real time, as in Gymnasium."""
     motors: tuple[str, ...] = ("motor",)
     """Names of the MJCF model's actuators that the task uses, in the order of actions and forces.
@@ -148,7 +148,7 @@ class Task(fields.Checked):
 
     It can be driven by any force. The analytic physics and the certificate use it.
     """
-    ideal_inner_steps: int = fields.integer(1, least=1)
+    ideal_inner_steps: int = fields.integer(1, minimum=1)
     """Integration steps per environment step when the actuator is ideal, as in Gymnasium."""
     paper: tuple[DCMotorActuator, ...] = ()
     """The paper's actuators, one for each motor; empty if there are none.
@@ -174,7 +174,7 @@ class Task(fields.Checked):
         """Validate the fields, and compute defaults that depend on other fields."""
         super().__post_init__()
         check_fields(self)
-        fields.check_names(self.integrators, INTEGRATORS, "integrator", every=True)
+        fields.check_names(self.integrators, INTEGRATORS, "integrator", list_all=True)
         asset_path(self.asset)
         half, size = len(self.state_names) // 2, (len(self.observation_names),)
         limits = self.max_forces.astype(np.float32)
@@ -309,7 +309,7 @@ class Task(fields.Checked):
         low, high = self.initial_bounds(recorded)  # type: ignore[arg-type]
         if recorded is not None:
             fields.check_names(
-                recorded.data, sorted(map(str, recorded.names)), "reset option", every=True
+                recorded.data, sorted(map(str, recorded.names)), "reset option", list_all=True
             )
             if not (np.isfinite([low, high]).all() and np.less_equal(low, high).all()):
                 raise ValueError(

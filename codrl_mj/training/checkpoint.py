@@ -23,8 +23,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 
-from codrl_mj.runs import checkpoints
-from codrl_mj.runs.files import below, writing
+from codrl_mj.runs import find_checkpoints
+from codrl_mj.runs.files import atomic_write, select_prefix
 
 NUM_CHECKPOINTS = 2
 """Number of checkpoints in a folder: the last, and the previous in case the last is damaged."""
@@ -121,7 +121,7 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
         for name in tensors:
             with torch.no_grad():
                 operator.attrgetter(name)(model).copy_(torch.tensor(arrays[f"tensor.{name}"]))
-        new_observations = envs.restore(below("env.", arrays))
+        new_observations = envs.restore(select_prefix("env.", arrays))
         model._last_obs = (
             arrays["last_obs"].copy() if new_observations is None else new_observations
         )
@@ -139,7 +139,7 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
             for name in _NOISE_MATRICES:
                 setattr(distribution, name, torch.tensor(arrays[f"noise.{name}"]))
         if hasattr(model, "restore"):
-            model.restore(below("model.", arrays))
+            model.restore(select_prefix("model.", arrays))
         numpy_state = facts["random.numpy"]
         np.random.set_state(
             numpy_state | {"state": numpy_state["state"] | {"key": arrays["random.numpy.key"]}}
@@ -185,12 +185,12 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
     content = save(state.arrays, metadata={"run": run, "facts": json.dumps(state.facts)})
     step = f"{state.facts['num_timesteps']:012d}"
     path = folder / f"step-{step}-{_digest(content)}.safetensors"
-    with writing(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(content)
         file.flush()
         # The content must be on the disk before an older checkpoint is deleted.
         os.fsync(file.fileno())
-    existing = checkpoints(folder)
+    existing = find_checkpoints(folder)
     older = [name for name, parts in existing.items() if parts["step"] < step]
     # Other files are of the same step, or of a later one that was damaged, so that the run went
     # back.
@@ -204,7 +204,7 @@ def load_checkpoint(folder: Path, run: str) -> State | None:
 
     Each checkpoint that cannot be used causes a warning.
     """
-    for remaining, (path, parts) in reversed(list(enumerate(checkpoints(folder).items()))):
+    for remaining, (path, parts) in reversed(list(enumerate(find_checkpoints(folder).items()))):
         try:
             return _read(path, parts["digest"], run)
         except (ValueError, OSError) as error:

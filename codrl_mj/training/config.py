@@ -30,21 +30,21 @@ class TrainConfig(Checked):
     """Training environment: task, actuator and all other settings."""
     agent: AgentConfig = PPOConfig()
     """The agent's settings."""
-    seed: int = integer(0, least=0, most=2**32 - 1)
+    seed: int = integer(0, minimum=0, maximum=2**32 - 1)
     """Seed of weights, actions and environments, from 0 to 2**32 - 1."""
-    total_steps: int | None = integer(200_000, least=1, optional=True)
+    total_steps: int | None = integer(200_000, minimum=1, optional=True)
     """Total environment steps, >= 1; rounded up to whole rollouts. None: until `total_episodes`."""
-    num_envs: int = integer(8, least=1)
+    num_envs: int = integer(8, minimum=1)
     """Number of parallel environments, >= 1."""
-    total_episodes: int | None = integer(None, least=1)
+    total_episodes: int | None = integer(None, minimum=1)
     """Total number of training episodes, >= 1; None: until `total_steps`."""
-    checkpoint_interval: int = integer(20_000, least=1)
+    checkpoint_interval: int = integer(20_000, minimum=1)
     """Environment steps between two checkpoints, >= 1; rounded up to the end of a rollout."""
-    evaluation_interval: int = integer(20_000, least=1)
+    evaluation_interval: int = integer(20_000, minimum=1)
     """Environment steps between two evaluations of the greedy policy, >= 1; the best policy is
     saved.
     """
-    evaluation_episodes: int = integer(20, least=1)
+    evaluation_episodes: int = integer(20, minimum=1)
     """Episodes of each evaluation, >= 1, on the task with Gymnasium's time limit and reward and
     with the training's actuator.
     """

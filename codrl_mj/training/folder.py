@@ -13,8 +13,8 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from codrl_mj.actuators import allow_imports, label_of, set_display_name
-from codrl_mj.fields import command, differing
+from codrl_mj.actuators import allow_imports, display_label, set_display_name
+from codrl_mj.fields import command, differences
 from codrl_mj.runs import (
     BEST,
     CHECKPOINT,
@@ -28,10 +28,10 @@ from codrl_mj.runs import (
     PROGRESS,
     RESULT,
     TENSORBOARD,
-    checkpoints,
+    find_checkpoints,
     finished,
 )
-from codrl_mj.runs.files import check_writable, leftovers, read_json
+from codrl_mj.runs.files import check_writable, read_json, temporary_files
 from codrl_mj.training.config import TrainConfig
 from codrl_mj.user_code import UntrustedCodeError
 
@@ -106,7 +106,7 @@ def prepare_run(
         raise FileExistsError(
             f"run folder {run} exists already: {remedy}choose another --out, or delete it"
         )
-    labels = [label_of(actuator) for actuator in config.actuators]
+    labels = [display_label(actuator) for actuator in config.actuators]
     return {
         "train": config.as_mapping(),
         **software,
@@ -139,7 +139,7 @@ def resume_command(run: Path) -> str:
 
 def describe_remains(run: Path) -> str:
     """Return a sentence on how to continue a training that was interrupted."""
-    if existing := checkpoints(run / CHECKPOINTS):
+    if existing := find_checkpoints(run / CHECKPOINTS):
         step = max(int(parts["step"]) for parts in existing.values())
         return f"Its last checkpoint is that of step {step:,}: continue with {resume_command(run)}"
     if (run / BEST / EVALUATION).exists():
@@ -153,7 +153,9 @@ def describe_remains(run: Path) -> str:
 def _leftovers(folder: Path) -> list[Path]:
     """Return temporary files of a training that were not completed."""
     return [
-        path for path, name in leftovers(folder) if name in _FILES or CHECKPOINT.fullmatch(name)
+        path
+        for path, name in temporary_files(folder)
+        if name in _FILES or CHECKPOINT.fullmatch(name)
     ]
 
 
@@ -182,14 +184,14 @@ def check_resumable(
     """
     # The caller has named the same configuration, and has thereby imported the same modules.
     started_config = load_config(run, trust=True)
-    if differences := differing(started_config.as_mapping(), config.as_mapping()):
-        changes = "; ".join(
+    if changes := differences(started_config.as_mapping(), config.as_mapping()):
+        description = "; ".join(
             f"{name}: {started!r} and {requested!r}"
-            for name, (started, requested) in differences.items()
+            for name, (started, requested) in changes.items()
         )
         raise ValueError(
             f"{run} was started with another configuration (its value, and the requested one):"
-            f" {changes}. A run keeps its settings: choose another run folder for other settings"
+            f" {description}. A run keeps its settings: choose another run folder for other settings"
         )
     record = read_json(run / CONFIG, "run configuration")
     versions = record.get("versions")
@@ -199,7 +201,7 @@ def check_resumable(
         )
     changed = [
         f"{name} was {was}, is {is_now}"
-        for name, (was, is_now) in differing(versions, software["versions"]).items()
+        for name, (was, is_now) in differences(versions, software["versions"]).items()
     ]
     if record.get("code") != software["code"]:
         changed.append(

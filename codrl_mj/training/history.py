@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 from codrl_mj.viz.pages.plots import Curve, Plot, save_png
 
 WINDOW = 100
@@ -119,7 +119,7 @@ class GrowingTable:
             [] if rows is None else [tuple(row) for row in rows.tolist()]
         )
         self._path, self._columns, self._num_written = path, columns, 0
-        with writing(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text(f"{','.join(columns)}\r\n", newline="")
             self.flush(temporary)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from codrl_mj.evaluation import check_episodes
 from codrl_mj.runs import CONFIG, finished
-from codrl_mj.runs.files import sealed, write_json
+from codrl_mj.runs.files import with_digest, write_json
 from codrl_mj.training import folder
 from codrl_mj.training.config import TrainConfig
 from codrl_mj.training.history import Progress
@@ -88,7 +88,7 @@ def train(
                 if record is not None:
                     # The configuration is the first file, so that a folder with other files of a
                     # run always has it.
-                    write_json(out / CONFIG, sealed(record))
+                    write_json(out / CONFIG, with_digest(record))
                 steps = config.total_steps
                 if steps is None:
                     # Episodes are counted; this is the number of steps of the longest possible

@@ -22,7 +22,7 @@ from codrl_mj.runs import (
     RESULT,
     TENSORBOARD,
 )
-from codrl_mj.runs.files import sealed, write_json
+from codrl_mj.runs.files import with_digest, write_json
 from codrl_mj.runs.policies import save_policy
 from codrl_mj.training import folder, history
 from codrl_mj.training.checkpoint import State, capture, load_checkpoint, restore, save_checkpoint
@@ -220,7 +220,7 @@ class Watcher(BaseCallback):
     def _save_policy(self, path: Path, evaluation: Evaluation) -> None:
         """Write the present policy with its evaluation."""
         save_policy(self.model.policy, self._config.agent, path)
-        write_json(path / EVALUATION, sealed(evaluation.as_mapping()))
+        write_json(path / EVALUATION, with_digest(evaluation.as_mapping()))
 
     def _report(self, evaluated: bool) -> None:
         if self.reports.last_mean("steps", 1) == self.model.num_timesteps:
@@ -278,7 +278,7 @@ class Watcher(BaseCallback):
             "best": self._best,
             "seconds": self._seconds_before + time.perf_counter() - self._start,
         }
-        write_json(self._out / RESULT, sealed(result))
+        write_json(self._out / RESULT, with_digest(result))
 
     def close(self) -> None:
         """Close the logger's files."""

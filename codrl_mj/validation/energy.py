@@ -209,7 +209,7 @@ def record_energies(
         states.append(physics.state)
     # Each signal has the shape (steps, motors).
     columns = np.array(traces).swapaxes(0, 1)
-    signals = dict(zip(trace_names(physics.plant.family), columns, strict=True))
+    signals = dict(zip(trace_names(physics.simulation.family), columns, strict=True))
     current, voltage, force = signals["current"], signals["voltage"], signals["actual_force"]
     current, state = np.vstack([np.zeros_like(current[:1]), current]), np.array(states)
 

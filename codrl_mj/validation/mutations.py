@@ -180,8 +180,8 @@ _VOLTAGE_LIMIT: Edit = (
     "voltage = 0.99 * min(max(voltage / 0.99, -",
 )
 _WARM_WINDING: Edit = (
-    "shaft.turn(parameters, resistance, timestep",
-    "shaft.turn(parameters, 1.01 * resistance, timestep",
+    "parameters, resistance, timestep, samples",
+    "parameters, 1.01 * resistance, timestep, samples",
 )
 _COMMIT = "                commit_slot(number, slot, time)\n"
 _LATE_FORCE: tuple[Edit, ...] = (

@@ -109,7 +109,7 @@ def compare_with_python(
     slot_of = motor_slots(data, actuators)
     families: dict[int, Family] = {index: type(actuator) for index, actuator in actuators.items()}
     parameters = {
-        index: parameters_type(families[index])(*actuator.numbers)
+        index: parameters_type(families[index])(*actuator.parameter_values)
         for index, actuator in actuators.items()
     }
     states = {
@@ -181,7 +181,7 @@ def stability(actuator: ActuatorModel, timestep: float) -> Iterator[Case]:
 
     For an unstable loop only the spectral radius is reported, because its instability is infinite.
     """
-    instability = float(actuator.instability(np.array([actuator.numbers]), timestep)[0])
+    instability = float(actuator.instability(np.array([actuator.parameter_values]), timestep)[0])
     radius = (
         spectral_radius(actuator, timestep)
         if isinstance(actuator, DCMotorActuator)

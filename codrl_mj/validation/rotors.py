@@ -80,7 +80,7 @@ def build_rotors(
                 ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE),
             )
         else:
-            mjcf.drive(driver, motor, None)
+            mjcf.configure_actuator(driver, motor, None)
     model = spec.compile()
     if not all(isinstance(motor, Motor) for motor in motors):
         install_callbacks(model)

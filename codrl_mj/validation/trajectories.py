@@ -129,7 +129,7 @@ def _run(
         try:
             for physics in (mujoco, analytic):
                 physics.step(force)
-            column = trace_names(analytic.plant.family).index("actual_force")
+            column = trace_names(analytic.simulation.family).index("actual_force")
             delivered = [float(physics.trace[-1, 0, column]) for physics in (mujoco, analytic)]
             growth.follow(force)
         except SimulationDivergedError as error:

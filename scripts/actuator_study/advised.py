@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from actuator_study import arms
-from codrl_mj.study.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, Prospect, advise, decide
-from codrl_mj.study.doses import AXES, SECONDS, posed
+from codrl_mj.study.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, LossBounds, advise, decide
+from codrl_mj.study.axes import AXES, SECONDS, study_env
 from codrl_mj.study.evidence import Evidence
 from codrl_mj.study.questions import MARGIN
 
@@ -18,13 +18,13 @@ def tested(task: str) -> dict[str, tuple[str, Any]]:
         {"marginal motor": arms.MARGINAL[task]} if task in arms.MARGINAL else {}
     )
     called = {
-        test: (motor_name(motor), posed(task, motor).actuator) for test, motor in motors.items()
+        test: (motor_name(motor), study_env(task, motor).actuator) for test, motor in motors.items()
     }
     if task not in arms.LOOPED:
         return called
     loops = {loop: arms.designed(task) if loop == "designed" else loop for loop in LOOPS}
     return called | {
-        loop: (f"paper's motor, {loop} loop", posed(task, loop_actuator).actuator)
+        loop: (f"paper's motor, {loop} loop", study_env(task, loop_actuator).actuator)
         for loop, loop_actuator in loops.items()
     }
 
@@ -39,7 +39,7 @@ def motor_name(motor: Mapping[str, Any]) -> str:
     return f"{motor['name']}, {motor['motor']['gear_ratio']:g}:1{volts}"
 
 
-def measured(evidence: Evidence, task: str, test: str) -> dict[str, Prospect]:
+def measured(evidence: Evidence, task: str, test: str) -> dict[str, LossBounds]:
     """Return the measured loss of policies on an actuator, by training option."""
     trained = {IDEAL: ("ideal", test), THROUGH: (test, test)}
     if test in ("weaker", "paper"):
@@ -49,13 +49,13 @@ def measured(evidence: Evidence, task: str, test: str) -> dict[str, Prospect]:
         for name, (arm, deployed) in trained.items()
     }
     return {
-        name: Prospect(outcome, outcome)
+        name: LossBounds(outcome, outcome)
         for name, outcome in outcomes.items()
         if outcome is not None
     }
 
 
-def judged(verdict: str, options: Mapping[str, Prospect]) -> str:
+def judged(verdict: str, options: Mapping[str, LossBounds]) -> str:
     """Judge a verdict: right if its option loses nothing, or surely less than doing nothing."""
     if verdict == MEASURE:
         return "says nothing"
@@ -79,13 +79,13 @@ def rows(evidence: Evidence) -> Iterator[dict[str, Any]]:
             advice = advise(actuator, task, evidence.without(test))
             if IDEAL not in options or not advice.options:
                 continue
-            predicted, outcome = advice.options[IDEAL].least, options[IDEAL].least
+            predicted, outcome = advice.options[IDEAL].lower, options[IDEAL].lower
             assert predicted is not None
             assert outcome is not None
             yield {
                 "task": task,
                 "actuator": name,
-                "beyond": advice.options[IDEAL].most is None,
+                "beyond": advice.options[IDEAL].upper is None,
                 **{f"predicted_{key}": value for key, value in predicted.loss._asdict().items()},
                 **{f"measured_{key}": value for key, value in outcome.loss._asdict().items()},
                 "measured_failed": outcome.failed,
@@ -93,7 +93,7 @@ def rows(evidence: Evidence) -> Iterator[dict[str, Any]]:
                 "said": advice.verdict,
                 "measured": (
                     decide(options)
-                    if THROUGH in options or outcome.spared
+                    if THROUGH in options or outcome.is_negligible
                     else "not trained through"
                 ),
                 "judged": judged(advice.verdict or MEASURE, options),
@@ -106,12 +106,12 @@ def left_out(evidence: Evidence) -> dict[str, float]:
     for task in SECONDS:
         for axis, known in AXES.items():
             # The first and the last severity have a neighbor on one side only.
-            for severity in known.doses[1:-1]:
+            for severity in known.severities[1:-1]:
                 loss = evidence.loss(task, axis, severity)
                 expected = evidence.without(f"{axis} {severity:g}").loss(task, axis, severity)
                 if loss is not None and expected is not None:
                     errors.append(abs(loss.outcome.loss.mean - expected.outcome.loss.mean))
-                    flips += loss.outcome.spared != expected.outcome.spared
+                    flips += loss.outcome.is_negligible != expected.outcome.is_negligible
     return {
         "doses": len(errors),
         "mean_error": float(np.mean(errors or [0.0])),

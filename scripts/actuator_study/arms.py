@@ -6,8 +6,8 @@ from typing import Any
 
 from codrl_mj.actuators import Drive
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.bench import redesigned
-from codrl_mj.study.doses import AXES, REAL, arm, at_home
+from codrl_mj.study.axes import AXES, REAL, arm, ideal_trial
+from codrl_mj.study.bench import drive_with_designed_loop
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import named_actuator
 
@@ -50,10 +50,10 @@ def drawn(task: str, axis: str, trained: float | None = None) -> Arm:
         axis: axis of the severities.
         trained: severity of the `matched` arm, half of the largest one drawn; None: the axis' own.
     """
-    largest_env = AXES[axis].at(
-        task, drawn_up_to(axis, AXES[axis].trained[task] if trained is None else trained)
+    largest_env = AXES[axis].make_env(
+        task, drawn_up_to(axis, AXES[axis].training_severity[task] if trained is None else trained)
     )
-    zero_env, actuator = AXES[axis].at(task, 0.0).actuator, largest_env.actuator
+    zero_env, actuator = AXES[axis].make_env(task, 0.0).actuator, largest_env.actuator
     text = {
         "lag": lambda: f"time_constant=uniform(0, {actuator.time_constant:g})",
         "weakness": lambda: f"gain=uniform({actuator.gain:g}, 1)",
@@ -69,25 +69,25 @@ def drawn(task: str, axis: str, trained: float | None = None) -> Arm:
 
 def drawn_up_to(axis: str, trained: float) -> float:
     """Return the largest drawn severity: twice the trained one, at most the largest tested one."""
-    return min(2.0 * trained, AXES[axis].doses[-1])
+    return min(2.0 * trained, AXES[axis].severities[-1])
 
 
 def designed(task: str) -> Drive:
     """Return the paper's motor and supply with a designed current loop."""
-    return redesigned(named_actuator("paper", task), task)
+    return drive_with_designed_loop(named_actuator("paper", task), task)
 
 
 @functools.cache
 def matched(task: str, axis: str) -> Arm:
     """Return the arm trained at a fixed severity of one axis."""
-    return arm(task, axis, AXES[axis].at(task, AXES[axis].trained[task]))
+    return arm(task, axis, AXES[axis].make_env(task, AXES[axis].training_severity[task]))
 
 
 def trial_at(arm: Arm, axis: str, severity: float) -> Trial:
     """Return the test of an arm's policies at a severity."""
-    return Trial(arm, f"{axis} {severity:g}", AXES[axis].at(arm.task, severity))
+    return Trial(arm, f"{axis} {severity:g}", AXES[axis].make_env(arm.task, severity))
 
 
 def trial_at_zero(arm: Arm, axis: str) -> Trial:
     """Return the test of an arm's policies at severity 0: on ideal forces or the axis' motor."""
-    return trial_at(arm, axis, 0.0) if AXES[axis].own_motor else at_home(arm)
+    return trial_at(arm, axis, 0.0) if AXES[axis].motor_at_zero else ideal_trial(arm)

@@ -6,7 +6,7 @@ from actuator_study import arms
 from actuator_study.arms import trial_at, with_fields
 from actuator_study.questions import on_loop, through_loop
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.doses import AXES, SECONDS, ideal, posed, supply, timestep
+from codrl_mj.study.axes import AXES, SECONDS, ideal, study_env, supply, timestep
 from codrl_mj.study.trials import Trial
 from codrl_mj.tasks import find_task
 
@@ -24,7 +24,7 @@ def windup() -> dict[str, list[tuple[Trial, Trial]]]:
                 trial_at(ideal(task), "supply", severity),
                 Trial(ideal(task), f"supply {severity:g}, winding up", wound_up(task, severity)),
             )
-            for severity in AXES["supply"].doses[1:]
+            for severity in AXES["supply"].severities[1:]
         ]
         for task in SECONDS
     }
@@ -36,7 +36,7 @@ def paper_loops(task: str) -> dict[str, EnvConfig]:
     The integration step is varied for motor and mechanics alike. The study's is a tenth of the
     policy's step, the paper's is the whole step.
     """
-    nominal, step = posed(task, "paper"), find_task(task).step_duration
+    nominal, step = study_env(task, "paper"), find_task(task).step_duration
     motor = nominal.actuator.motor
     return {
         "feed-forward 0": with_fields(nominal, controller__kff=0.0),

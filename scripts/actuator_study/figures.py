@@ -13,15 +13,15 @@ from codrl_mj.study.advice import (
     BUY,
     IDEAL,
     MEASURE,
-    RANDOMISE,
+    RANDOMIZE,
     THROUGH,
     decide,
-    known,
-    tests_through,
+    option_bounds,
+    tested_points,
 )
-from codrl_mj.study.doses import AXES, SECONDS
+from codrl_mj.study.axes import AXES, SECONDS
 from codrl_mj.study.evidence import Evidence
-from codrl_mj.study.pages import COLOURS, MARKERS, TITLES, legend, save
+from codrl_mj.study.pages import COLORS, MARKERS, TITLES, add_legend, save_figure
 from codrl_mj.study.questions import Scores
 from codrl_mj.study.trials import Trial
 
@@ -29,7 +29,7 @@ from codrl_mj.study.trials import Trial
 _LOWEST = -0.1
 _REGIONS = {
     IDEAL: "#d9f0e3",
-    RANDOMISE: "#dbe9f6",
+    RANDOMIZE: "#dbe9f6",
     THROUGH: "#fdebc8",
     BUY: "#f6d5cc",
     MEASURE: "#eeeeee",
@@ -39,7 +39,7 @@ _REGIONS = {
 def losses(path: Path, evidence: Evidence) -> bool:
     """Draw the losses of ideal-trained policies: panel per axis, row per task, column per severity.
 
-    A cell shows the mean loss, and below it the share of policies that lose more than `FAILED`,
+    A cell shows the mean loss, and below it the share of policies that lose more than `FAILURE_MARGIN`,
     if there are any.
 
     Returns:
@@ -51,9 +51,9 @@ def losses(path: Path, evidence: Evidence) -> bool:
     panels: Any = figure.subplots(2, 3).ravel()
     drawn = False
     for number, (panel, (name, axis)) in enumerate(zip(panels, AXES.items(), strict=True)):
-        means = np.full((len(SECONDS), len(axis.doses) - 1), np.nan)
+        means = np.full((len(SECONDS), len(axis.severities) - 1), np.nan)
         for row, task in enumerate(SECONDS):
-            for column, severity in enumerate(axis.doses[1:]):
+            for column, severity in enumerate(axis.severities[1:]):
                 if (loss := evidence.loss(task, name, severity)) is None:
                     continue
                 outcome, drawn = loss.outcome, True
@@ -67,13 +67,13 @@ def losses(path: Path, evidence: Evidence) -> bool:
             np.clip(means, 0.0, 1.0), cmap="YlOrBr", vmin=0.0, vmax=1.0, aspect="auto"
         )
         panel.set_xticks(
-            range(len(axis.doses) - 1), [f"{severity:g}" for severity in axis.doses[1:]]
+            range(len(axis.severities) - 1), [f"{severity:g}" for severity in axis.severities[1:]]
         )
         named = [f"{TITLES[task]}\n{size(task)}" for task in SECONDS]
         panel.set_yticks(range(len(SECONDS)), named if number % 3 == 0 else [], fontsize=8)
         panel.set(xlabel=axis.unit, title=THINGS[name].capitalize())
     figure.colorbar(shown, ax=panels, label="lost [share of the span]", shrink=0.6)
-    save(figure, path)
+    save_figure(figure, path)
     return drawn
 
 
@@ -99,7 +99,7 @@ def insured(path: Path, evidence: Evidence) -> bool:
             trained = {"drawn": f"{name}, drawn", "matched": name}
             for number, (kind, label) in enumerate(kinds.items()):
                 outcome = evidence.outcome(
-                    task, trained.get(kind, kind), f"{name} {axis.trained[task]:g}"
+                    task, trained.get(kind, kind), f"{name} {axis.training_severity[task]:g}"
                 )
                 if outcome is not None:
                     drawn = True
@@ -107,11 +107,11 @@ def insured(path: Path, evidence: Evidence) -> bool:
                         panel,
                         axis_index + 0.19 * (number - 1.5),
                         1.0 - outcome.lost,
-                        COLOURS[number],
+                        COLORS[number],
                         label,
                     )
         named = [
-            f"{thing} {severity_text(task, name, AXES[name].trained[task])}"
+            f"{thing} {severity_text(task, name, AXES[name].training_severity[task])}"
             for name, thing in THINGS.items()
         ]
         panel.set_xticks(range(len(AXES)), named)
@@ -119,8 +119,8 @@ def insured(path: Path, evidence: Evidence) -> bool:
         panel.grid(axis="y", color="0.9")
         panel.set_axisbelow(True)
     if drawn:
-        legend(figure, 4)
-    save(figure, path)
+        add_legend(figure, 4)
+    save_figure(figure, path)
     return drawn
 
 
@@ -156,7 +156,7 @@ def bars(
             if values.size:
                 x = group_index + 0.8 * ((number + 0.5) / len(group) - 0.5)
                 kind = labels.index(label)
-                color, marker = COLOURS[kind % len(COLOURS)], MARKERS[kind % len(MARKERS)]
+                color, marker = COLORS[kind % len(COLORS)], MARKERS[kind % len(MARKERS)]
                 clipped = np.maximum(values, _LOWEST)
                 # The dots stand beside the error bar so that they do not hide it.
                 axes.plot(
@@ -172,8 +172,8 @@ def bars(
     axes.set(ylabel="score [share of the span]", title=title, xlim=(-0.5, len(groups) - 0.5))
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
-    legend(figure, 3)
-    save(figure, path)
+    add_legend(figure, 3)
+    save_figure(figure, path)
 
 
 def chart(path: Path, evidence: Evidence) -> bool:
@@ -200,13 +200,13 @@ def chart(path: Path, evidence: Evidence) -> bool:
     panels: Any = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
     zero_severities, shown_regions = dict.fromkeys(AXES, 0.0), set[int]()
     for panel, task in zip(panels, tasks, strict=False):
-        points = tests_through(evidence, task)
+        points = tested_points(evidence, task)
         regions = np.array(
             [
                 [
                     list(_REGIONS).index(
                         decide(
-                            known(
+                            option_bounds(
                                 evidence,
                                 task,
                                 zero_severities | {"lag": lag, "supply": shortfall},
@@ -254,12 +254,12 @@ def chart(path: Path, evidence: Evidence) -> bool:
         )
     )
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize="small")
-    save(figure, path)
+    save_figure(figure, path)
     return True
 
 
 def _values(scores: Scores, trial: Trial) -> np.ndarray:
-    return np.array(list(scores.of(trial).values()))
+    return np.array(list(scores.by_seed(trial).values()))
 
 
 def _bars(

@@ -20,13 +20,21 @@ from actuator_study.questions import (
 )
 from actuator_study.units import THINGS, scale, severity_text, short, size
 from codrl_mj.runs.files import write_json
-from codrl_mj.study.advice import BUY, IDEAL, RANDOMISE, THROUGH
-from codrl_mj.study.doses import AXES, FLOORS, SECONDS, at_home, ideal
+from codrl_mj.study.advice import BUY, IDEAL, RANDOMIZE, THROUGH
+from codrl_mj.study.axes import AXES, FLOORS, SECONDS, ideal, ideal_trial
 from codrl_mj.study.evidence import STUDIES, Evidence, Outcome
-from codrl_mj.study.inference import detectable
-from codrl_mj.study.pages import TITLES, conclusions, markdown_table, write_csv, write_page
+from codrl_mj.study.inference import detectable_difference
+from codrl_mj.study.pages import TITLES, markdown_table, read_conclusions, write_csv, write_page
 from codrl_mj.study.questions import LEVEL, MARGIN, Scores, Verdict, judge
-from codrl_mj.study.trials import FAILED, RUNS, TOTALS, Collected, Trial, run_rows, trial_rows
+from codrl_mj.study.trials import (
+    FAILURE_MARGIN,
+    RUNS,
+    TOTALS,
+    Collected,
+    Trial,
+    run_rows,
+    trial_rows,
+)
 
 PAGE, FOLDER = "actuators.md", "actuators"
 """The page, and the folder beside it with its figures and tables."""
@@ -54,7 +62,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
     """
     folder, scores = (
         out / FOLDER,
-        Scores(collected, FLOORS, [at_home(ideal(task)) for task in SECONDS]),
+        Scores(collected, FLOORS, [ideal_trial(ideal(task)) for task in SECONDS]),
     )
     primary_verdicts, secondary_verdicts = (
         judge(scores, primary(), primary=True),
@@ -67,7 +75,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
     drawn = _draw(scores, evidence, folder)
     parts = [
         "# What does an actuator cost?\n",
-        conclusions(out / PAGE),
+        read_conclusions(out / PAGE),
         _borne(evidence, drawn),
         _insured(drawn),
         _motors(evidence, drawn),
@@ -90,8 +98,8 @@ def write_tables(
 ) -> list[Path]:
     """Write the tables: policies by test, trials, questions, and the cost of the trainings."""
     tables = {
-        RUNS: run_rows(collected, scores.of),
-        TRIALS: trial_rows(collected, scores.of),
+        RUNS: run_rows(collected, scores.by_seed),
+        TRIALS: trial_rows(collected, scores.by_seed),
         HYPOTHESES: (
             verdict.row(len(primary_verdicts))
             for verdict in (*primary_verdicts, *secondary_verdicts)
@@ -125,7 +133,7 @@ def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:
     for task in SECONDS:
         home = ideal(task)
         motors[TITLES[task].replace("Continuous ", "Continuous\n")] = [
-            ("ideal-trained, on ideal forces", at_home(home)),
+            ("ideal-trained, on ideal forces", ideal_trial(home)),
             ("ideal-trained, on the good motor", on_motor(home, "good")),
             *(
                 [
@@ -155,29 +163,33 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
         for name, axis in AXES.items():
             known = [
                 (severity, loss.outcome)
-                for severity in axis.doses[1:]
+                for severity in axis.severities[1:]
                 if (loss := evidence.loss(task, name, severity))
             ]
             # Only severities below the first harmful one count, whatever follows.
             harmless = [
-                severity for severity, _ in itertools.takewhile(lambda pair: pair[1].spared, known)
+                severity
+                for severity, _ in itertools.takewhile(lambda pair: pair[1].is_negligible, known)
             ]
-            hurt = next(((severity, outcome) for severity, outcome in known if outcome.hurt), None)
+            harmful = next(
+                ((severity, outcome) for severity, outcome in known if outcome.is_harmful), None
+            )
             factor, unit_text = scale(task, name)
             text = f"≤{short(factor * harmless[-1] if harmless else 0.0)}"
-            if hurt is not None:
+            if harmful is not None:
                 text += (
-                    f", ≥{short(factor * hurt[0])} {unit_text}"
-                    f" ({round(hurt[1].failed * len(hurt[1].lost))})"
+                    f", ≥{short(factor * harmful[0])} {unit_text}"
+                    f" ({round(harmful[1].failed * len(harmful[1].lost))})"
                 )
             else:
                 text += f" {unit_text}"
             rows[-1].append(text if known else "–")
+    margin = FAILURE_MARGIN
     return f"""## What policies bear
 
 Up to the first number it is harmless: ideal-trained policies lose at most {MARGIN:g} of the score on the mean, surely
-at most {FAILED:g}, and a tenth of their success. From the second on it hurts: they surely lose more than {FAILED:g},
-or a tenth of their success. In brackets: how many of 20 fail there, by losing more than {FAILED:g}. Between the two,
+at most {margin:g}, and a tenth of their success. From the second on it hurts: they surely lose more than {margin:g},
+or a tenth of their success. In brackets: how many of 20 fail there, by losing more than {margin:g}. Between the two,
 measure.
 
 *Lag* is a time constant: a loop of bandwidth f has 1/(2 π f). *Missing force* is the share that a gear loses,
@@ -194,7 +206,10 @@ def _insured(drawn: Mapping[str, Path]) -> str:
     rows = [
         [
             TITLES[task],
-            *(severity_text(task, name, axis.trained[task]) for name, axis in AXES.items()),
+            *(
+                severity_text(task, name, axis.training_severity[task])
+                for name, axis in AXES.items()
+            ),
         ]
         for task in arms.TRAINED
     ]
@@ -218,7 +233,7 @@ def _motors(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
             if test.endswith("motor"):
                 prospects = advised.measured(evidence, task, test)
                 cells = [
-                    _lost(prospects[kind].most) if kind in prospects else "–"
+                    _lost(prospects[kind].upper) if kind in prospects else "–"
                     for kind in (IDEAL, THROUGH)
                 ]
                 rows.append([TITLES[task], name, test.removesuffix(" motor"), *cells])
@@ -274,7 +289,7 @@ def _advised(
     right = collections.Counter(row["said"] for row in advice_rows if row["judged"] == "right")
     never = [
         f"*{verdict}*"
-        for verdict in (RANDOMISE, THROUGH, BUY)
+        for verdict in (RANDOMIZE, THROUGH, BUY)
         if verdict not in {row["said"] for row in advice_rows}
     ]
     left = advised.left_out(evidence)
@@ -316,7 +331,7 @@ def _verdicts(verdicts: Sequence[Verdict], others: Sequence[Verdict]) -> str:
                 verdict.question.name,
                 verdict.outcome,
                 effect_text(verdict),
-                p_text(verdict.corrected),
+                p_text(verdict.corrected_p),
                 statement,
             ]
         )
@@ -372,7 +387,9 @@ def decided_table(verdicts: Sequence[Verdict], titles: Mapping[str, str]) -> str
         )
         rows.append([title, *map(str, (len(judged), len(decided), beyond))])
     return markdown_table(
-        ["secondary comparisons", "of", "decided", f"by more than {MARGIN:g}"], rows, numbers=3
+        ["secondary comparisons", "of", "decided", f"by more than {MARGIN:g}"],
+        rows,
+        numeric_columns=3,
     )
 
 
@@ -429,11 +446,11 @@ def _method(collected: Collected, scores: Scores) -> str:
     text = f"""A score is the mean return over {grid.episodes} test episodes in shares of the span: 0 is what random
 actions get on ideal forces, 1 what ideal-trained policies get there on the mean ({"; ".join(known) or "none yet"}).
 CartPole's return is the paper's: steps within 0.1 m of the centre. In {TRIALS} *failed* is the share of policies that
-score below {1 - FAILED:g}. Effects are differences of mean scores; policies
+score below {1 - FAILURE_MARGIN:g}. Effects are differences of mean scores; policies
 count once on every task. Intervals are by Student's t, p of permutation tests, of equivalence by two one-sided ones
 with a margin of {MARGIN:g}; primary ones are corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds
-a difference of {detectable(runs, LEVEL / 12):.2f} standard deviations is found with a chance of 80 % at the strictest
-level."""
+a difference of {detectable_difference(runs, LEVEL / 12):.2f} standard deviations is found with a
+chance of 80 % at the strictest level."""
     # Links may be longer than a line and must not be broken.
     wrapped = (
         textwrap.fill(" ".join(paragraph.split()), 120, break_long_words=False)

@@ -19,14 +19,14 @@ from actuator_study.arms import (
 )
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.doses import AXES, SECONDS, arm, at_home, generic, ideal, posed
+from codrl_mj.study.axes import AXES, SECONDS, arm, generic, ideal, ideal_trial, study_env
 from codrl_mj.study.questions import Contrast, Question
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
 
 
 def _trained_trial(arm: Arm, axis: str) -> Trial:
-    return trial_at(arm, axis, AXES[axis].trained[arm.task])
+    return trial_at(arm, axis, AXES[axis].training_severity[arm.task])
 
 
 def _contrasts(axis: str, arm_of: Any, reference_arm_of: Any) -> tuple[Contrast, ...]:
@@ -45,25 +45,25 @@ def _generic(task: str) -> Arm:
 def on_loop(arm: Arm, loop: str) -> Trial:
     """Return the test of an arm's policies on the paper's motor under a current loop."""
     return Trial(
-        arm, loop, posed(arm.task, arms.designed(arm.task) if loop == "designed" else loop)
+        arm, loop, study_env(arm.task, arms.designed(arm.task) if loop == "designed" else loop)
     )
 
 
 def through_loop(task: str, loop: str) -> Arm:
     """Return the arm trained on the paper's motor under a current loop."""
-    return arm(task, loop, posed(task, arms.designed(task) if loop == "designed" else loop))
+    return arm(task, loop, study_env(task, arms.designed(task) if loop == "designed" else loop))
 
 
 def on_motor(arm: Arm, kind: str) -> Trial:
     """Return the test of an arm's policies on a motor of the catalogue."""
     chosen = {"good": GOOD, "marginal": MARGINAL}[kind]
-    return Trial(arm, f"{kind} motor", posed(arm.task, chosen[arm.task]))
+    return Trial(arm, f"{kind} motor", study_env(arm.task, chosen[arm.task]))
 
 
 def through_motor(task: str, label: str = "", **changes: Any) -> Arm:
     """Return the arm trained through the marginal motor, with labeled changes to it."""
     named = ", ".join(filter(None, ["marginal motor", label]))
-    return arm(task, named, posed(task, MARGINAL[task], **changes))
+    return arm(task, named, study_env(task, MARGINAL[task], **changes))
 
 
 WRONG: dict[str, tuple[str, float]] = {
@@ -80,7 +80,7 @@ A torque constant that the loop does not know is the axis `weakness`.
 def wrong_motors(task: str) -> dict[str, EnvConfig]:
     """Return environments whose actuator differs from the trained `weaker`, by name."""
     nominal, step, force = (
-        posed(task, "weaker"),
+        study_env(task, "weaker"),
         find_task(task).step_duration,
         find_task(task).max_force,
     )
@@ -111,7 +111,7 @@ def wrong_motors(task: str) -> dict[str, EnvConfig]:
 
 def identified(task: str) -> Arm:
     """Return the arm trained on what identification leaves open: R within 2 %, L within 10 %."""
-    nominal = posed(task, "weaker")
+    nominal = study_env(task, "weaker")
     motor = nominal.actuator.motor
 
     def around(name: str, share: float) -> str:
@@ -201,7 +201,8 @@ def primary() -> list[Question]:
             "motors",
             "On a good motor that exists, ideal-trained policies score as high as on ideal forces",
             tuple(
-                Contrast(on_motor(ideal(task), "good"), at_home(ideal(task))) for task in SECONDS
+                Contrast(on_motor(ideal(task), "good"), ideal_trial(ideal(task)))
+                for task in SECONDS
             ),
             "equivalent",
         ),
@@ -227,7 +228,7 @@ def secondary() -> list[Question]:
     for task in SECONDS:
         home = ideal(task)
         for axis, described in AXES.items():
-            for severity in described.doses[1:]:
+            for severity in described.severities[1:]:
                 statement = f"{task}, ideal-trained: {axis} {severity:g} over none"
                 contrasts.append(
                     (
@@ -278,12 +279,17 @@ def secondary() -> list[Question]:
     for task in SECONDS:
         home = ideal(task)
         contrasts.append(
-            ("motors", f"{task}: good motor over ideal", on_motor(home, "good"), at_home(home))
+            ("motors", f"{task}: good motor over ideal", on_motor(home, "good"), ideal_trial(home))
         )
     for task in MARGINAL:
         marginal_trial = on_motor(ideal(task), "marginal")
         contrasts.append(
-            ("motors", f"{task}: marginal motor over ideal", marginal_trial, at_home(ideal(task)))
+            (
+                "motors",
+                f"{task}: marginal motor over ideal",
+                marginal_trial,
+                ideal_trial(ideal(task)),
+            )
         )
         statement = f"{task}, marginal motor: trained through it over ideal-trained"
         contrasts.append(

@@ -8,8 +8,8 @@ from actuator_study.exploration import explored
 from actuator_study.page import FOLDER, write
 from actuator_study.questions import trials
 from codrl_mj.fields import integer
-from codrl_mj.study.doses import SECONDS
-from codrl_mj.study.grid import check_chosen
+from codrl_mj.study.axes import SECONDS
+from codrl_mj.study.grid import check_selection
 from codrl_mj.study.program import Program
 from codrl_mj.study.trials import Grid
 
@@ -27,17 +27,17 @@ class ActuatorStudy(Program):
     """Folder of the run folders."""
     tasks: tuple[str, ...] = tuple(SECONDS)
     """Tasks."""
-    seeds: int = integer(20, least=1)
+    seeds: int = integer(20, minimum=1)
     """Training runs of every arm, with seeds from 0."""
-    episodes: int = integer(50, least=1)
+    episodes: int = integer(50, minimum=1)
     """Test episodes of every policy."""
-    total_steps: int | None = integer(None, least=1)
+    total_steps: int | None = integer(None, minimum=1)
     """Environment steps of every training, for quick trials; None: the agents' own budgets."""
 
     def __post_init__(self) -> None:
         """Validate."""
         super().__post_init__()
-        check_chosen("tasks", self.tasks, SECONDS)
+        check_selection("tasks", self.tasks, SECONDS)
 
     @property
     def grid(self) -> Grid:

@@ -92,13 +92,13 @@ class Late(ActuatorModel):
     advance: ClassVar = staticmethod(advance)
     observe: ClassVar = staticmethod(observe)
 
-    time_constant: float = real(0.0, least=0.0, unit="s")
+    time_constant: float = real(0.0, minimum=0.0, unit="s")
     """Time constant [s], >= 0."""
-    delay: float = real(0.0, least=0.0, unit="s")
+    delay: float = real(0.0, minimum=0.0, unit="s")
     """Delay of the command [s], >= 0, at most `LONGEST` steps of the policy."""
     gain: float = real(1.0, above=0.0)
     """Share of the desired torque that is delivered in steady state, > 0."""
-    held: float = real(10.0, least=1.0)
+    held: float = real(10.0, minimum=1.0)
     """Number of integration steps per policy step, >= 1."""
     largest: float = real(1.0, above=0.0, unit="N*m")
     """Torque [N*m] at which a shown command is 1, > 0."""

@@ -18,19 +18,19 @@ from actuator_study.page import (
     write_tables,
 )
 from actuator_study.units import THINGS, severity_text
-from codrl_mj.study.doses import AXES, FLOORS, at_home, ideal
+from codrl_mj.study.axes import AXES, FLOORS, ideal, ideal_trial
 from codrl_mj.study.pages import (
-    COLOURS,
+    COLORS,
     TITLES,
-    conclusions,
-    legend,
+    add_legend,
     markdown_table,
-    save,
+    read_conclusions,
+    save_figure,
     write_csv,
     write_page,
 )
 from codrl_mj.study.questions import MARGIN, Scores, Verdict, judge
-from codrl_mj.study.trials import FAILED, RUNS, Collected, Trial
+from codrl_mj.study.trials import FAILURE_MARGIN, RUNS, Collected, Trial
 from codrl_mj.tasks import find_task
 from insurance_study.learning import LEARNING, learning_rows, still_rising
 from insurance_study.questions import (
@@ -95,7 +95,7 @@ class Summary(NamedTuple):
         return self._format("", "") if self.scores.size else "–"
 
     def _format(self, median: str, tests: str) -> str:
-        failed, success = np.sum(self.scores < 1.0 - FAILED), np.mean(self.success)
+        failed, success = np.sum(self.scores < 1.0 - FAILURE_MARGIN), np.mean(self.success)
         return f"{np.mean(self.scores):z.2f}{median}; {failed}{tests}; {100 * success:.0f} %"
 
 
@@ -104,7 +104,9 @@ def summarize(collected: Collected, scores: Scores, trials: Iterable[Trial]) -> 
     pairs: list[tuple[float, float]] = []
     for trial in trials:
         success = collected.scores(trial, "success")
-        pairs += [(score, success.get(seed, np.nan)) for seed, score in scores.of(trial).items()]
+        pairs += [
+            (score, success.get(seed, np.nan)) for seed, score in scores.by_seed(trial).items()
+        ]
     values = np.reshape(pairs, (-1, 2))
     return Summary(values[:, 0], values[:, 1])
 
@@ -117,10 +119,10 @@ def write(collected: Collected, out: Path) -> list[Path]:
     """
     folder, scores = (
         out / FOLDER,
-        Scores(collected, FLOORS, [at_home(ideal(task)) for task in TASKS]),
+        Scores(collected, FLOORS, [ideal_trial(ideal(task)) for task in TASKS]),
     )
-    primary_verdicts = judge(scores, primary(), primary=True, least=PLANNED)
-    secondary_verdicts = judge(scores, secondary(), least=PLANNED)
+    primary_verdicts = judge(scores, primary(), primary=True, min_policies=PLANNED)
+    secondary_verdicts = judge(scores, secondary(), min_policies=PLANNED)
     tables = write_tables(folder, collected, scores, primary_verdicts, secondary_verdicts)
     spans = {task: ceiling - FLOORS[task] for task, ceiling in scores.ceilings.items()}
     learned = learning_rows(collected, folder / LEARNING)
@@ -128,7 +130,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
     draw(folder / FIGURE, scores)
     parts = [
         "# What insures a policy?\n",
-        conclusions(out / PAGE),
+        read_conclusions(out / PAGE),
         _things(collected, scores),
         _kinds(collected, scores),
         f"![Scores by what policies were trained on]({FOLDER}/{FIGURE})\n",
@@ -174,8 +176,9 @@ def _things(collected: Collected, scores: Scores) -> str:
             rows.append(cells)
         title = f"{TITLES[task]}, a step of {1000 * find_task(task).step_duration:g} ms"
         tables.append(markdown_table([title, *_SHOWN.values()], rows))
+    margin = FAILURE_MARGIN
     text = f"""Look for what is most like yours. Mean score, 1 being ideal-trained policies on ideal forces and 0 random
-actions; how many of {PLANNED} policies fail, by losing more than {FAILED:g}; how often episodes succeed. The highest
+actions; how many of {PLANNED} policies fail, by losing more than {margin:g}; how often episodes succeed. The highest
 mean is bold. *Random* actuators draw strength, lag and delay for every episode, and push; they reach as far as is said
 in brackets, or twice as far. *The same dose* is what it is tested on; *drawn* is that one thing alone, from none
 to twice as much, of forces and voltages at most 70 %. Forces are shares of the largest one, or N·m; voltages are shares
@@ -232,13 +235,13 @@ def draw(path: Path, scores: Scores) -> None:
         for axis_index, axis in enumerate(AXES):
             for number, kind in enumerate(kind for kind in KIND_NAMES if kind in shown):
                 if axis in _AXES.get(kind, AXES):
-                    values = list(scores.of(trial_at(KINDS[kind](task, axis), axis)).values())
+                    values = list(scores.by_seed(trial_at(KINDS[kind](task, axis), axis)).values())
                     if values:
                         dots(
                             panel,
                             axis_index + 0.14 * (number - 2.5),
                             values,
-                            COLOURS[shown[kind]],
+                            COLORS[shown[kind]],
                             KIND_NAMES[kind],
                         )
         severities = [
@@ -249,8 +252,8 @@ def draw(path: Path, scores: Scores) -> None:
         panel.set(title=TITLES[task], ylabel="score [share of the span]")
         panel.grid(axis="y", color="0.9")
         panel.set_axisbelow(True)
-    legend(figure, 3)
-    save(figure, path)
+    add_legend(figure, 3)
+    save_figure(figure, path)
 
 
 def _verdicts(verdicts: Sequence[Verdict], scores: Scores) -> str:
@@ -264,7 +267,7 @@ def _verdicts(verdicts: Sequence[Verdict], scores: Scores) -> str:
             verdict.outcome,
             effect_text(verdict),
             _by_task(verdict, scores),
-            p_text(verdict.corrected),
+            p_text(verdict.corrected_p),
         ]
         rows.append([verdict.question.name, *judged, str(min(verdict.runs)), statement])
     header = ["", "holds", "effect [95 %]", "by task", "corrected p", "policies", "says"]
@@ -285,11 +288,13 @@ def _by_task(verdict: Verdict, scores: Scores) -> str:
         pairs = [
             pair
             for pair in verdict.question.contrasts
-            if pair.one.arm.task == task and scores.stratum([pair])
+            if pair.treatment.arm.task == task and scores.stratum([pair])
         ]
         stratum = scores.stratum(pairs) if pairs else None
         texts.append(
-            "–" if stratum is None else f"{np.mean(stratum.one) - np.mean(stratum.other):+.2f}"
+            "–"
+            if stratum is None
+            else f"{np.mean(stratum.treatment) - np.mean(stratum.control):+.2f}"
         )
     return ", ".join(texts)
 

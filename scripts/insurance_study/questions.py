@@ -8,7 +8,7 @@ from actuator_study.arms import DRAWN
 from actuator_study.arms import drawn as drawn_severities
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.doses import AXES, arm, at_home, ideal, posed, timestep
+from codrl_mj.study.axes import AXES, arm, ideal, ideal_trial, study_env, timestep
 from codrl_mj.study.questions import Contrast, Question
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
@@ -16,7 +16,8 @@ from insurance_study.late import Late
 
 TASKS = ("pendulum", "furuta", "acrobot")
 SEVERITIES: Mapping[str, Mapping[str, float]] = {
-    task: {axis: description.trained[task] for axis, description in AXES.items()} for task in TASKS
+    task: {axis: description.training_severity[task] for axis, description in AXES.items()}
+    for task in TASKS
 }
 """Task -> axis -> severity that is trained and tested.
 
@@ -34,7 +35,7 @@ REMEMBERED = ("lag", "delay")
 
 def reach(task: str, axis: str) -> float:
     """Return random actuators' largest severity: twice the harmless or the smallest tested one."""
-    return max(2.0 * HARMLESS[task][axis], AXES[axis].doses[1])
+    return max(2.0 * HARMLESS[task][axis], AXES[axis].severities[1])
 
 
 def late(task: str, **fields: float) -> Late:
@@ -68,7 +69,7 @@ def generic(
         pulse_force=0.25 * share * force, pulse_duration=step, pulse_interval=10 * step
     )
     fields: dict[str, Any] = {"disturbances": pushes} if with_pushes else {}
-    return arm(task, name, posed(task, late(task), randomize=drawn, **fields))
+    return arm(task, name, study_env(task, late(task), randomize=drawn, **fields))
 
 
 @functools.cache
@@ -76,7 +77,7 @@ def pushes(task: str) -> Arm:
     """Return the arm trained on random pushes only."""
     step, force = find_task(task).step_duration, find_task(task).max_force
     pushed = Disturbances(pulse_force=0.25 * force, pulse_duration=step, pulse_interval=10 * step)
-    return arm(task, "random pushes alone", posed(task, disturbances=pushed))
+    return arm(task, "random pushes alone", study_env(task, disturbances=pushed))
 
 
 def strength(task: str) -> Arm:
@@ -97,7 +98,7 @@ def double(task: str) -> Arm:
 @functools.cache
 def through(task: str, axis: str) -> Arm:
     """Return the arm trained at the severity of one axis."""
-    return arm(task, axis, AXES[axis].at(task, SEVERITIES[task][axis]))
+    return arm(task, axis, AXES[axis].make_env(task, SEVERITIES[task][axis]))
 
 
 @functools.cache
@@ -109,7 +110,7 @@ def drawn(task: str, axis: str) -> Arm:
 def remembering_env(task: str, axis: str, severity: float) -> EnvConfig:
     """Return an environment with a lag or a delay, whose policy sees its last four commands."""
     seconds = severity * find_task(task).step_duration
-    return posed(
+    return study_env(
         task,
         late(task, **{{"lag": "time_constant"}.get(axis, axis): seconds}),
         observe_actuator=True,
@@ -129,19 +130,19 @@ def trial_at(arm: Arm, axis: str, severity: float | None = None) -> Trial:
         return Trial(
             arm, f"{axis} {severity:g}, remembering", remembering_env(arm.task, axis, severity)
         )
-    return Trial(arm, f"{axis} {severity:g}", AXES[axis].at(arm.task, severity))
+    return Trial(arm, f"{axis} {severity:g}", AXES[axis].make_env(arm.task, severity))
 
 
 def home(arm: Arm) -> Trial:
     """Return the test of an arm's policies on ideal forces."""
     if arm.config.env.observe_actuator:
         return Trial(arm, "ideal, remembering", remembering_env(arm.task, "lag", 0.0))
-    return at_home(arm)
+    return ideal_trial(arm)
 
 
 def neighbors(task: str, axis: str) -> dict[str, float]:
     """Return the tested severities next to the trained one, as "less" and "more", without 0."""
-    severities, index = AXES[axis].doses, AXES[axis].doses.index(SEVERITIES[task][axis])
+    severities, index = AXES[axis].severities, AXES[axis].severities.index(SEVERITIES[task][axis])
     neighboring = {
         "less": severities[index - 1],
         "more": severities[index + 1] if index + 1 < len(severities) else 0.0,
@@ -307,7 +308,7 @@ def secondary() -> list[Question]:
 def trials() -> tuple[Trial, ...]:
     """Return every trial of the study once, including those of the first study's arms."""
     contrasts = [pair for question in (*primary(), *secondary()) for pair in question.contrasts]
-    homes = [Contrast(at_home(ideal(task)), at_home(ideal(task))) for task in TASKS]
+    homes = [Contrast(ideal_trial(ideal(task)), ideal_trial(ideal(task))) for task in TASKS]
     return tuple({trial.name: trial for pair in (*contrasts, *homes) for trial in pair}.values())
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from codrl_mj.fields import integer
-from codrl_mj.study.grid import check_chosen
+from codrl_mj.study.grid import check_selection
 from codrl_mj.study.program import Program
 from codrl_mj.study.trials import Grid
 from insurance_study.page import FOLDER, write
@@ -23,11 +23,11 @@ class InsuranceStudy(Program):
     """Folder of the run folders."""
     tasks: tuple[str, ...] = TASKS
     """Tasks."""
-    seeds: int = integer(20, least=1)
+    seeds: int = integer(20, minimum=1)
     """Training runs of every arm, with seeds from 0."""
-    first_seed: int = integer(0, least=0)
+    first_seed: int = integer(0, minimum=0)
     """First of these seeds; the pilot's is 1000."""
-    episodes: int = integer(50, least=1)
+    episodes: int = integer(50, minimum=1)
     """Test episodes of every policy."""
     new_only: bool = False
     """Skip tests of policies of the first study's arms, which would have to be trained again."""
@@ -35,7 +35,7 @@ class InsuranceStudy(Program):
     def __post_init__(self) -> None:
         """Validate."""
         super().__post_init__()
-        check_chosen("tasks", self.tasks, TASKS)
+        check_selection("tasks", self.tasks, TASKS)
 
     @property
     def grid(self) -> Grid:

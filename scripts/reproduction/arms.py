@@ -6,7 +6,7 @@ from typing import Any
 
 from codrl_mj.actuators import IDEAL, CurrentLoop, DCMotorActuator
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.doses import CENTRE_RADIUS
+from codrl_mj.study.axes import CENTER_RADIUS
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
 from codrl_mj.training import TrainConfig
@@ -48,7 +48,7 @@ class PaperArm(Arm):
         """Tests of the arm's policies, by name."""
         envs = {TEST: EnvConfig(self.task, self.actuator, self.physics)}
         if self.task == "cartpole":
-            envs[CENTRE] = dataclasses.replace(envs[TEST], options={"center_radius": CENTRE_RADIUS})
+            envs[CENTRE] = dataclasses.replace(envs[TEST], options={"center_radius": CENTER_RADIUS})
         return {test: Trial(self, test, env) for test, env in envs.items()}
 
     def cut_off(self, episodes: int) -> "PaperArm":

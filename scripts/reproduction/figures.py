@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.study.doses import CENTRE_RADIUS
-from codrl_mj.study.pages import COLOURS, legend, save
+from codrl_mj.study.axes import CENTER_RADIUS
+from codrl_mj.study.pages import COLORS, add_legend, save_figure
 from codrl_mj.tasks import (
     acrobot,
     cartpole,
@@ -23,9 +23,9 @@ from reproduction.rows import LAST
 from reproduction.value_iteration import Optimum
 
 STYLES = {
-    "ideal": (COLOURS[0], "--"),
-    "paper gains": (COLOURS[2], "-"),
-    "fast gains": (COLOURS[1], "-."),
+    "ideal": (COLORS[0], "--"),
+    "paper gains": (COLORS[2], "-"),
+    "fast gains": (COLORS[1], "-."),
 }
 """Motor of an arm -> color and dashes."""
 SETTINGS = {"paper": "as printed", "repaired": "repaired"}
@@ -36,7 +36,7 @@ LEARNED = {
     "counts": "number of\nepisodes",
 }
 """Learning curve -> label of its axis."""
-_ERROR = COLOURS[3]
+_ERROR = COLORS[3]
 # Width of all figures [in].
 _WIDTH = 8.0
 
@@ -91,7 +91,7 @@ CURVES: dict[str, list[StateCurve]] = {
     ],
     "cartpole": _entries(
         "cartpole",
-        {0: (-CENTRE_RADIUS, CENTRE_RADIUS), 2: (-cartpole.ANGLE_LIMIT, cartpole.ANGLE_LIMIT)},
+        {0: (-CENTER_RADIUS, CENTER_RADIUS), 2: (-cartpole.ANGLE_LIMIT, cartpole.ANGLE_LIMIT)},
     ),
 }
 """Task -> curves of its states: the paper's, and every entry of the state."""
@@ -147,8 +147,8 @@ def draw_learning(path: Path, task: str, curves: Table) -> bool:
     all_axes[-1, 0].set_xlabel("training episode" if len(names) == 1 else "epoch of 4000 steps")
     if len(names) == 1:
         all_axes[0, 0].set_ylabel(f"return, mean of last {LAST}")
-    legend(figure, 2 if repaired else 3)
-    save(figure, path)
+    add_legend(figure, 2 if repaired else 3)
+    save_figure(figure, path)
     return True
 
 
@@ -185,8 +185,8 @@ def draw_torque(path: Path, task: str, torques: Table) -> bool:
         )
         axes.set(ylabel=f"torque [N·m],\n{motor}")
     all_axes[-1, 0].set_xlabel("time [s]")
-    legend(figure, 3)
-    save(figure, path)
+    add_legend(figure, 3)
+    save_figure(figure, path)
     return True
 
 
@@ -221,8 +221,8 @@ def draw_states(path: Path, task: str, states: Table) -> bool:
             )
         axes.set_ylabel(curve.label.replace("_dot", "'"), fontsize="small")
     all_axes[-1, 0].set_xlabel("time [s]")
-    legend(figure, 3)
-    save(figure, path)
+    add_legend(figure, 3)
+    save_figure(figure, path)
     return True
 
 
@@ -245,7 +245,7 @@ def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[O
     """
     figure, ((value_axes, path_axes),) = _panels(1, 2)
     discounts = np.array(list(values))
-    value_axes.plot(1 - discounts, list(values.values()), color=COLOURS[0], marker=".")
+    value_axes.plot(1 - discounts, list(values.values()), color=COLORS[0], marker=".")
     value_axes.set_xscale("log")
     value_axes.invert_xaxis()
     marked_discounts = [best.discount for best in optima]
@@ -255,7 +255,7 @@ def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[O
         rotation=45,
     )
     value_axes.set_xticks([], minor=True)
-    value_axes.axvline(1 - marked_discounts[0], color=COLOURS[2], linestyle="--", linewidth=1)
+    value_axes.axvline(1 - marked_discounts[0], color=COLORS[2], linestyle="--", linewidth=1)
     value_axes.annotate(
         "the paper's",
         (1 - marked_discounts[0], 0.5 * max(values.values())),
@@ -271,7 +271,7 @@ def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[O
         path_axes.plot(
             times,
             best.episode.state[:, 0],
-            color=COLOURS[index],
+            color=COLORS[index],
             linestyle=style,
             label=f"{best.discount:g}",
         )
@@ -279,8 +279,8 @@ def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[O
     path_axes.set(
         xlabel="time [s]", ylabel="x [m]", xlim=(0, 120), title="best policy at discount factor"
     )
-    legend(figure, 5)
-    save(figure, path)
+    add_legend(figure, 5)
+    save_figure(figure, path)
 
 
 def _panels(rows: int, columns: int, row_height: float = 2.6, sharey: bool = False) -> Any:

@@ -4,8 +4,8 @@ import collections
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from codrl_mj.study.pages import TITLES, conclusions, markdown_table, write_page
-from codrl_mj.study.trials import numbers_as_text
+from codrl_mj.study.pages import TITLES, markdown_table, read_conclusions, write_page
+from codrl_mj.study.trials import format_ranges
 from reproduction import figures
 from reproduction.checks import NOT_TESTABLE, OUTCOMES, Verdict, medians, number
 from reproduction.claims import PAPER_SAYS, TIMES, UPRIGHT, Claim, as_text
@@ -36,7 +36,7 @@ def write(findings: Findings, out: Path) -> list[Path]:
         _head(findings),
         statements_table(findings),
         verdicts_line(findings.verdicts),
-        f"## Conclusions\n\n{conclusions(out / PAGE)}",
+        f"## Conclusions\n\n{read_conclusions(out / PAGE)}",
         f"## Figures\n\n{_pictures(drawn)}",
         _method(findings),
         _missing(findings),
@@ -195,7 +195,7 @@ actuator of its training. `scripts/reproduce.py` ([how](../reproduction.md)) wri
 def _missing(findings: Findings) -> str:
     """Return the section on missing and failed trainings."""
     lines: Iterable[str] = [
-        f"- {name}: seeds {numbers_as_text(seeds)}" for name, seeds in findings.missing.items()
+        f"- {name}: seeds {format_ranges(seeds)}" for name, seeds in findings.missing.items()
     ]
     lines = [*lines, *(f"- {name} failed: {error}" for name, error in findings.failures.items())]
     if not lines:

@@ -11,7 +11,7 @@ from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import holds_since
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.pages import read_csv
-from codrl_mj.study.trials import Collected, plain, training_seconds
+from codrl_mj.study.trials import Collected, to_scalar, training_seconds
 from codrl_mj.tasks import TASKS
 from codrl_mj.tasks.pendulum import GOAL_HOLD, MAX_TORQUE, upright_angle
 from codrl_mj.training import EVALUATION_SEED
@@ -155,9 +155,9 @@ def run_row(arm: PaperArm, seed: int, run: Trained) -> Row:
     row |= {
         f"last_{LAST}": float(run.column("return")[-LAST:].mean()) if len(run.episodes) else None
     }
-    row |= {name: plain(run.tests[TEST][name]) for name in TESTED} | dict.fromkeys(FURTHER)
+    row |= {name: to_scalar(run.tests[TEST][name]) for name in TESTED} | dict.fromkeys(FURTHER)
     if CENTRE in run.tests:
-        row["centred"] = plain(run.tests[CENTRE]["returns"]) / TASKS[arm.task].max_episode_steps
+        row["centred"] = to_scalar(run.tests[CENTRE]["returns"]) / TASKS[arm.task].max_episode_steps
         epochs = epochs_of(arm, run)
         row["long_epoch"] = first_epoch(epochs.lengths >= FULL_LENGTH)
         row["paid_epoch"] = first_epoch(epochs.returns >= FULL_RETURN)

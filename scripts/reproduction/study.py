@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from codrl_mj.fields import integer
-from codrl_mj.study.grid import check_chosen
+from codrl_mj.study.grid import check_selection
 from codrl_mj.study.pages import write_csv
 from codrl_mj.study.program import Program
 from codrl_mj.study.trials import Arm, Grid
@@ -44,11 +44,11 @@ class Reproduction(Program):
     """Settings of the agents: as printed in the paper, and repaired where these do not learn."""
     root: Path = Path("runs/paper")
     """Folder of the run folders."""
-    sarsa_seeds: int = integer(30, least=1)
+    sarsa_seeds: int = integer(30, minimum=1)
     """Training runs of each kind of SARSA (mountain_car), which take seconds."""
-    episodes: int | None = integer(None, least=1)
+    episodes: int | None = integer(None, minimum=1)
     """Maximum number of training episodes, for quick trials; default: the paper's budgets."""
-    test_episodes: int = integer(100, least=1)
+    test_episodes: int = integer(100, minimum=1)
     """Test episodes of each policy."""
     mesh: tyro.conf.Suppress[Mesh] = Mesh()
     """Mesh of value iteration."""
@@ -56,8 +56,8 @@ class Reproduction(Program):
     def __post_init__(self) -> None:
         """Validate."""
         super().__post_init__()
-        check_chosen("tasks", self.tasks, TASKS)
-        check_chosen("settings", self.settings, ("paper", "repaired"))
+        check_selection("tasks", self.tasks, TASKS)
+        check_selection("settings", self.settings, ("paper", "repaired"))
 
     @property
     def plan(self) -> dict[str, Any]:

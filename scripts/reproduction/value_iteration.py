@@ -25,11 +25,11 @@ DISCOUNTS = (0.85, 0.9, 0.95, 0.99, 0.999)
 class Mesh(Checked):
     """Grid of states at which values are computed, with interpolation between its points."""
 
-    positions: int = integer(121, least=2)
+    positions: int = integer(121, minimum=2)
     """Number of positions from wall to wall, >= 2."""
-    speeds: int = integer(121, least=2)
+    speeds: int = integer(121, minimum=2)
     """Number of speeds between the limits, >= 2."""
-    forces: int = integer(21, least=3)
+    forces: int = integer(21, minimum=3)
     """Number of forces, evenly from -1 N to 1 N, >= 3; odd, so that one of them is 0."""
 
     def __post_init__(self) -> None:

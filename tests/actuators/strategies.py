@@ -1,4 +1,4 @@
-"""Random actuators, over everything that may be constructed."""
+"""Hypothesis strategies for actuators, over all values that their constructors accept."""
 
 import dataclasses
 
@@ -19,12 +19,12 @@ from codrl_mj.actuators import (
 
 
 def between(low, high):
-    """Finite floats from low to high."""
+    """Return a strategy for finite floats from low to high."""
     return st.floats(low, high, allow_nan=False, allow_infinity=False)
 
 
 def zero_or(low, high):
-    """Zero (a feature that is off), or a float from low to high."""
+    """Return a strategy for zero (a feature that is off) or a float from low to high."""
     return st.just(0.0) | between(low, high)
 
 
@@ -68,7 +68,7 @@ every_actuator = st.builds(
     between(-5, 5),
     zero_or(1e-3, 5),
 )
-"""Current loops with everything that they can have."""
+"""Current loops with all of their options."""
 gear_motors = st.builds(
     GearMotor,
     resistance=between(0.01, 20),
@@ -99,7 +99,7 @@ drives = st.builds(
     sampled_loops,
     st.none() | st.builds(Supply, between(1, 60), zero_or(1e-3, 0.1)),
 )
-"""Motors that could be bought."""
+"""Motors in the range of commercial ones."""
 of_every_family = st.one_of(
     every_actuator,
     drives,
@@ -112,4 +112,4 @@ of_every_family = st.one_of(
         max_torque=between(1e-3, 50),
     ),
 )
-"""Actuators of all our families."""
+"""Actuators of all built-in families."""

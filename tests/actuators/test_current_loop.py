@@ -1,4 +1,4 @@
-"""The current loop, what feeds it and what is left of it under a voltage: the paper's algorithm, and closed forms."""
+"""Current loop, supply and voltage-driven motor, against the paper's algorithm and closed forms."""
 
 import dataclasses
 import math
@@ -27,8 +27,8 @@ timesteps = between(1e-4, 0.1)
 
 
 def advance(actuator, dt, state, torque, speed):
-    """State, torque and signals after a step."""
-    parameters = parameters_type(type(actuator))(*actuator.numbers)
+    """Return state, torque and signals after a step."""
+    parameters = parameters_type(type(actuator))(*actuator.parameter_values)
     return actuator.advance(
         parameters, dt, actuator.State(*state), Inputs(torque, 0.0, speed, 0.0, 0.0)
     )
@@ -41,17 +41,17 @@ def with_substeps(actuator, substeps):
 
 
 def available(actuator, current):
-    """The voltage [V] that is left at a current [A]."""
-    supply, most = actuator.supply or Supply(), actuator.controller.max_voltage
-    open_circuit = most if math.isinf(supply.voltage) else supply.voltage
-    return min(most, max(open_circuit - supply.resistance * abs(current), 0.0))
+    """Return the available voltage [V] at a current [A]."""
+    supply, max_voltage = actuator.supply or Supply(), actuator.controller.max_voltage
+    open_circuit = max_voltage if math.isinf(supply.voltage) else supply.voltage
+    return min(max_voltage, max(open_circuit - supply.resistance * abs(current), 0.0))
 
 
-# -- the paper's algorithm ----------------------------------------------------------------------------------
+# -- the paper's algorithm -------------------------------------------------------------------------
 
 
 @given(actuators, supplies, timesteps, states, between(-20, 20), between(-20, 20))
-def test_a_step_is_the_papers_under_the_voltage_that_is_left(
+def test_a_step_follows_the_paper_within_the_available_voltage(
     actuator, supply, dt, state, force, velocity
 ):
     actuator = dataclasses.replace(with_substeps(actuator, 1), supply=supply)
@@ -60,8 +60,8 @@ def test_a_step_is_the_papers_under_the_voltage_that_is_left(
     current, integral, error, voltage, delivered = of_actuator(actuator, limit)(
         dt, *state, force, velocity
     )
-    # relative to the largest terms, before the limit: a rounding error is no smaller where terms
-    # cancel
+    # The tolerance is relative to the largest terms before the limit: a rounding error does not
+    # shrink when terms cancel.
     motor, loop = actuator.motor, actuator.controller
     i_ref, emf = (
         abs(force * arm / motor.torque_constant),
@@ -93,7 +93,7 @@ def test_a_step_is_the_papers_under_the_voltage_that_is_left(
 
 
 @given(actuators, supplies, timesteps, states, between(-20, 20), between(-20, 20))
-def test_substeps_are_that_many_steps_each_with_its_own_sag(
+def test_substeps_equal_separate_steps_with_a_supply_voltage_each(
     actuator, supply, dt, state, torque, speed
 ):
     actuator = dataclasses.replace(actuator, supply=supply)
@@ -108,11 +108,11 @@ ERRORS = np.random.default_rng(3).normal(size=200)
 
 @pytest.mark.parametrize("dt", [1e-3, 0.05, 1.0])
 @pytest.mark.parametrize("constant", [1e-3, 0.05, 2.0, 100.0])
-def test_integral_and_derivative_are_scipys_backward_euler_filters(constant, dt):
-    """Of 1/(s + leak), and of s/(1 + Td*s): with no other gain and no current the error is the reference itself."""
+def test_integral_and_derivative_match_scipys_backward_euler_filters(constant, dt):
+    """Compare with 1/(s + leak) and s/(1 + Td*s); the error is the reference without gains."""
     leaking = CurrentLoop(kp=0.0, integral_leak=constant)
     filtering = CurrentLoop(kp=0.0, kd=1.0, max_voltage=math.inf, derivative_time_constant=constant)
-    integral, previous, found = 0.0, 0.0, []
+    integral, previous, values = 0.0, 0.0, []
     for error in ERRORS:
         (_, integral, _), *_ = advance(
             DCMotorActuator(controller=leaking), dt, (0.0, integral, 0.0), error, 0.0
@@ -120,21 +120,21 @@ def test_integral_and_derivative_are_scipys_backward_euler_filters(constant, dt)
         (*_, previous), _, signals = advance(
             DCMotorActuator(controller=filtering), dt, (0.0, 0.0, previous), error, 0.0
         )
-        found.append((integral, signals.voltage))
+        values.append((integral, signals.voltage))
     for ours, system in zip(
-        np.transpose(found), (([1.0], [1.0, constant]), ([1.0, 0.0], [constant, 1.0])), strict=True
+        np.transpose(values), (([1.0], [1.0, constant]), ([1.0, 0.0], [constant, 1.0])), strict=True
     ):
         numerator, denominator, _ = signal.cont2discrete(system, dt, method="backward_diff")
         theirs = signal.lfilter(numerator.ravel(), denominator, ERRORS)
         np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-12 * np.abs(theirs).max())
 
 
-# -- closed forms of where it ends --------------------------------------------------------------------------
+# -- closed forms of the steady state --------------------------------------------------------------
 
 STALLED, LINE = Motor(resistance=2.0, torque_constant=0.5), Motor(1.5, 0.1, 0.06, 0.06)
 SHARE, STIFF = Motor(2.0, 0.1, 0.5, 0.7), CurrentLoop(kp=1e6, max_voltage=12.0)
 FREE = CurrentLoop(kp=6.0, max_voltage=math.inf, bemf_compensation=False)
-RESTS = {  # name: actuator, torque, speed, steps of 10 ms, current
+STEADY_STATES = {  # name: actuator, torque, speed, steps of 10 ms, current
     "stall": (DCMotorActuator(STALLED, STIFF), 1e5, 0.0, 600, 12.0 / 2.0),
     "the supply is the limit": (
         DCMotorActuator(STALLED, STIFF, Supply(6.0)),
@@ -208,34 +208,37 @@ RESTS = {  # name: actuator, torque, speed, steps of 10 ms, current
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize("name", RESTS)
-def test_it_ends_where_the_closed_form_says(name, sign):
-    actuator, torque, speed, steps, current = RESTS[name]
+@pytest.mark.parametrize("name", STEADY_STATES)
+def test_the_current_settles_at_the_closed_form(name, sign):
+    actuator, torque, speed, steps, current = STEADY_STATES[name]
     state = (0.0, 0.0, 0.0)
     for _ in range(steps):
         state, *_ = advance(actuator, 0.01, state, sign * torque, sign * speed)
     assert state.current == pytest.approx(sign * current, rel=1e-12, abs=1e-12)
 
 
-# -- what is refused, and what it says of itself ------------------------------------------------------------
+# -- errors, and descriptive properties ----------------------------------------------------------
 
 
-def test_a_resistance_under_which_the_saturated_current_oscillates_is_refused_with_its_bound():
+def test_raises_if_the_supply_makes_the_saturated_current_oscillate():
     # i' = i + (V - Rs*i - R*i)*dt/L: the pole 1 - (R + Rs)*dt/L is -1 at Rs = 2*L/dt - R = 3
     allowed, refused = (
         DCMotorActuator(supply=Supply(resistance=resistance)) for resistance in (2.99, 3.0)
     )
     assert allowed.check(0.05) is None
-    radii = DCMotorActuator.instability(np.array([allowed.numbers, refused.numbers]), 0.05)
+    radii = DCMotorActuator.instability(
+        np.array([allowed.parameter_values, refused.parameter_values]), 0.05
+    )
     np.testing.assert_array_equal(radii < 1.0, [True, False])
     with pytest.raises(
         ValueError, match=r"supply\.resistance = 3: must be < 2\*L/dt - R = 3 ohm .* of 0\.05 s"
     ):
         refused.check(0.05)
-    assert with_substeps(refused, 2).check(0.05) is None  # the remedy
+    # The remedy of the message.
+    assert with_substeps(refused, 2).check(0.05) is None
 
 
-def test_it_says_what_it_is_made_of():
+def test_properties_and_commands_follow_from_the_fields():
     actuator = DCMotorActuator(
         Motor(2.0, 0.3, 0.5, arm_radius=0.15), CurrentLoop(max_voltage=math.inf)
     )
@@ -252,20 +255,21 @@ def test_it_says_what_it_is_made_of():
     assert limits == [24.0, 12.0, 24.0]
     command = actuator.commands()["current"]
     assert command.actuator is actuator
-    assert (command.torque_per_unit, command.limit) == (0.5, None)  # tau = kT*i
+    # The torque is kT*i.
+    assert (command.torque_per_unit, command.limit) == (0.5, None)
     noisy = DCMotorActuator(controller=CurrentLoop(current_noise=0.1))
     assert noisy.random
     assert noisy.commands()["voltage"].actuator.random
     assert not DCMotorActuator(controller=CurrentLoop(current_bias=0.1)).random
 
 
-# -- under a commanded voltage ------------------------------------------------------------------------------
+# -- under a commanded voltage ---------------------------------------------------------------------
 
 
 @given(
     actuators, supplies, between(1e-4, 0.05), between(-20, 20), between(-150, 150), between(-20, 20)
 )
-def test_the_terminal_voltage_is_the_command_within_what_is_left(
+def test_the_terminal_voltage_is_the_command_within_the_available_voltage(
     actuator, supply, dt, current, volts, speed
 ):
     actuator = dataclasses.replace(actuator, supply=supply)
@@ -291,18 +295,17 @@ def test_the_terminal_voltage_is_the_command_within_what_is_left(
     assert signals.voltage == pytest.approx(voltage, rel=1e-12, abs=1e-12 * size * (sag > 0.0))
     assert state.current == pytest.approx(expected, rel=1e-12, abs=1e-12 * size)
     assert delivered == motor.torque_constant * state.current
-    assert (
-        signals.reference_current == signals.current == state.current
-    )  # what follows counts as asked for
+    # Without a desired torque, the delivered one counts as desired.
+    assert signals.reference_current == signals.current == state.current
 
 
-def test_under_a_voltage_only_the_winding_is_left_and_the_sensor_drives_nothing():
+def test_a_commanded_voltage_bypasses_the_loop_and_the_sensor():
     actuator = DCMotorActuator(
         controller=CurrentLoop(5.0, 3.0, 1e-3, substeps=2, integral_leak=1.0, current_bias=0.5)
     )
     command = actuator.commands()["voltage"]
     driven, loop = command.actuator, command.actuator.controller
-    assert (actuator.tracks, driven.tracks) == (True, False)
+    assert (actuator.is_torque_controlled, driven.is_torque_controlled) == (True, False)
     assert (loop.kp, loop.ki, loop.kd, loop.integral_leak, loop.bemf_compensation) == (
         0,
         0,
@@ -311,7 +314,7 @@ def test_under_a_voltage_only_the_winding_is_left_and_the_sensor_drives_nothing(
         False,
     )
     assert (loop.substeps, command.limit) == (2, 24.0)
-    kept = {
+    applied_fields = {
         "motor.resistance",
         "motor.inductance",
         "motor.back_emf_constant",
@@ -319,10 +322,10 @@ def test_under_a_voltage_only_the_winding_is_left_and_the_sensor_drives_nothing(
     }
     fields = {f"motor.{field.name}" for field in dataclasses.fields(Motor)}
     fields |= {f"controller.{field.name}" for field in dataclasses.fields(CurrentLoop)}
-    assert {*command.fixed} == fields - kept
+    assert {*command.fixed} == fields - applied_fields
     assert advance(driven, 0.01, (1.0, 0.0, 0.0), 7.0, 2.0)[2].voltage == 7.0
     parameters, rest = (
-        parameters_type(type(driven))(*driven.numbers),
+        parameters_type(type(driven))(*driven.parameter_values),
         Inputs(0.0, 0.0, 0.0, 0.0, 0.0),
     )
     assert driven.observe(parameters, 0.01, driven.Signals(1.5, 1.5, 7.0, 0.0), rest) == (2.0, 2.0)

@@ -1,4 +1,4 @@
-"""The drive: exact winding, closed form and stepping, margins, anti-windup, what a bench would measure."""
+"""Drive: exact winding, closed form against stepping, margins, anti-windup, bench measurements."""
 
 import dataclasses
 import math
@@ -14,11 +14,11 @@ from scipy.linalg import expm
 
 import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, Inputs, SampledLoop, Supply, parameters_type
-from codrl_mj.actuators.sampled import designed_gains, jump, run_samples
+from codrl_mj.actuators.sampled import designed_gains, run_samples, solve_designed_loop
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 
-# R [ohm], L [H], K [N*m/A], V [V]: maxon EC45 flat, DCX22L; Faulhaber 1331T; T-motor AK80-6;
-# QUBE-Servo 2; PMG-132
+# R [ohm], L [H], K [N*m/A], V [V] of maxon EC45 flat and DCX22L, Faulhaber 1331T, T-motor AK80-6,
+# QUBE-Servo 2 and PMG-132.
 WINDINGS = {
     "ec45": (0.464, 0.322e-3, 25.1e-3, 24.0),
     "dcx22l": (0.168, 0.018e-3, 6.95e-3, 9.0),
@@ -40,20 +40,23 @@ def drive(name, rate=20e3, **loop):
     )
 
 
-def responses(one, timestep, torques, speeds):
-    """States, torques and signals of steps under held torques and speeds at the rotor."""
-    parameters, state = parameters_type(Drive)(*one.numbers), one.State(*[0.0] * 9)
-    found = []
+def responses(actuator, timestep, torques, speeds):
+    """Return states, torques and signals of steps under held torques and speeds at the rotor."""
+    parameters, state = (
+        parameters_type(Drive)(*actuator.parameter_values),
+        actuator.State(*[0.0] * 9),
+    )
+    steps = []
     for torque, speed in zip(torques, speeds, strict=True):
-        state, delivered, signals = one.advance(
+        state, delivered, signals = actuator.advance(
             parameters, timestep, state, Inputs(torque, 0.0, speed, 0.0, 0.0)
         )
-        found.append((state, delivered, signals))
-    return found
+        steps.append((state, delivered, signals))
+    return steps
 
 
 def limits_of(signals):
-    """Names of the limits that a step met; `saturated` says whether there are any."""
+    """Return the names of the limits reached in a step, consistent with `saturated`."""
     met = [
         name
         for name in ("voltage", "current", "temperature")
@@ -65,26 +68,33 @@ def limits_of(signals):
 
 @pytest.mark.parametrize("compensated", [True, False])
 @every_winding
-def test_the_winding_is_exact_and_what_is_delivered_is_its_mean(name, compensated):
-    """Against the matrix exponential of current and charge, sample by sample, under the voltages of the same loop."""
+def test_the_winding_is_exact_and_the_delivered_torque_is_the_mean(name, compensated):
+    """Compare with the matrix exponential of current and charge, sample by sample."""
     resistance, inductance, constant, voltage = WINDINGS[name]
-    one, timestep, rng = drive(name, bemf_compensation=compensated), 0.002, np.random.default_rng(0)
+    actuator, timestep, rng = (
+        drive(name, bemf_compensation=compensated),
+        0.002,
+        np.random.default_rng(0),
+    )
     torques = rng.uniform(-2, 2, 20) * constant * voltage / resistance
     speeds = rng.uniform(-1, 1, 20) * voltage / constant
     kp, ki = designed_gains(
         resistance, inductance, 1 / 20e3, 2 * math.pi * DEFAULT_BANDWIDTH * 20e3
     )
     a, b = -resistance / inductance, 1 / inductance
-    exact = expm(np.array([[a, 0, b], [1, 0, 0], [0, 0, 0]]) / 20e3)  # of current, charge, voltage
+    # The states are current, charge and voltage.
+    exact = expm(np.array([[a, 0, b], [1, 0, 0], [0, 0, 0]]) / 20e3)
     current, integral = 0.0, 0.0
-    steps = zip(responses(one, timestep, torques, speeds), torques, constant * speeds, strict=True)
+    steps = zip(
+        responses(actuator, timestep, torques, speeds), torques, constant * speeds, strict=True
+    )
     for (state, delivered, signals), torque, back_emf in steps:
         charge, volts = 0.0, 0.0
         for _ in range(40):
             error = torque / constant - current
-            asked = kp * error + ki * (integral + error) + back_emf * compensated
-            applied = min(max(asked, -voltage), voltage)
-            integral += error + (applied - asked) / (kp + ki)
+            command = kp * error + ki * (integral + error) + back_emf * compensated
+            applied = min(max(command, -voltage), voltage)
+            integral += error + (applied - command) / (kp + ki)
             current, charge, _ = exact @ (current, charge, applied - back_emf)
             volts += applied
         scale = voltage / resistance
@@ -105,23 +115,23 @@ def test_the_winding_is_exact_and_what_is_delivered_is_its_mean(name, compensate
     ],
     ids=["closed_form", "uncompensated", "stepped", "limited", "voltage"],
 )
-def test_what_is_drawn_is_heat_work_and_field_as_a_fine_integration_has_them(
-    loop, supply, commanded
-):
-    """Volts times amperes and R*i^2 within the samples, by scipy under the voltages of a loop that is seen in each."""
+def test_the_electrical_power_is_heat_work_and_field_energy(loop, supply, commanded):
+    """Compare power and R*i^2 within samples with scipy's, at voltages of single-sample steps."""
     resistance, inductance, constant, voltage = WINDINGS["qube"]
-    one, samples, rng = drive("qube", **loop), 40, np.random.default_rng(2)
-    one = dataclasses.replace(one, supply=Supply(voltage, supply))
+    actuator, samples, rng = drive("qube", **loop), 40, np.random.default_rng(2)
+    actuator = dataclasses.replace(actuator, supply=Supply(voltage, supply))
     torques = (
         rng.uniform(-1.5, 1.5, 5) * constant * (voltage if commanded else voltage / resistance)
     )
     speeds = rng.uniform(-0.8, 0.8, 5) * voltage / constant
-    one = one.commands()["voltage"].actuator if commanded else one
-    whole = [step[2] for step in responses(one, samples / 20e3, torques, speeds)]
-    fine = responses(one, 1 / 20e3, np.repeat(torques, samples), np.repeat(speeds, samples))
+    actuator = actuator.commands()["voltage"].actuator if commanded else actuator
+    long_steps = [step[2] for step in responses(actuator, samples / 20e3, torques, speeds)]
+    short_steps = responses(
+        actuator, 1 / 20e3, np.repeat(torques, samples), np.repeat(speeds, samples)
+    )
     volts, starts = (
-        [step[2].voltage for step in fine],
-        np.append(0.0, [step[0].current for step in fine]),
+        [step[2].voltage for step in short_steps],
+        np.append(0.0, [step[0].current for step in short_steps]),
     )
     energies = []
     for number, back_emf in enumerate(np.repeat(constant * speeds, samples)):
@@ -129,21 +139,23 @@ def test_what_is_drawn_is_heat_work_and_field_as_a_fine_integration_has_them(
         def flow(_, y, u=volts[number], b=back_emf):
             return [(u - b - resistance * y[0]) / inductance, u * y[0], resistance * y[0] ** 2]
 
-        found = solve_ivp(flow, (0.0, 1 / 20e3), [starts[number], 0.0, 0.0], rtol=1e-12, atol=1e-15)
-        energies.append(found.y[1:, -1])
+        solution = solve_ivp(
+            flow, (0.0, 1 / 20e3), [starts[number], 0.0, 0.0], rtol=1e-12, atol=1e-15
+        )
+        energies.append(solution.y[1:, -1])
     drawn, heat = np.array(energies).reshape(5, samples, 2).sum(axis=1).T * 20e3 / samples
     watts = voltage**2 / resistance
     np.testing.assert_allclose(
-        [step.electrical_power for step in whole], drawn, rtol=0, atol=1e-9 * watts
+        [step.electrical_power for step in long_steps], drawn, rtol=0, atol=1e-9 * watts
     )
     np.testing.assert_allclose(
-        [step.copper_loss for step in whole], heat, rtol=0, atol=1e-9 * watts
+        [step.copper_loss for step in long_steps], heat, rtol=0, atol=1e-9 * watts
     )
-    moved = constant * speeds * [step.current for step in whole]
+    moved = constant * speeds * [step.current for step in long_steps]
     field = np.diff(0.5 * inductance * starts[::samples] ** 2) * 20e3 / samples
-    balance = [step.electrical_power - step.copper_loss for step in whole] - moved - field
+    balance = [step.electrical_power - step.copper_loss for step in long_steps] - moved - field
     np.testing.assert_allclose(balance, 0.0, atol=1e-13 * watts)
-    assert all(step.copper_loss >= resistance * step.current**2 for step in whole)
+    assert all(step.copper_loss >= resistance * step.current**2 for step in long_steps)
 
 
 _share = st.floats(0.0, 1.0)
@@ -159,20 +171,20 @@ _share = st.floats(0.0, 1.0)
     st.lists(st.tuples(_share, _share), min_size=1, max_size=8),
     st.sampled_from([0.1, 0.5, 1.0, 2.0, 10.0]),
 )
-def test_the_closed_form_is_the_stepping(name, rate, bandwidth, samples, commands, amplitude):
-    """From nothing saturated to everything."""
+def test_the_closed_form_equals_stepping(name, rate, bandwidth, samples, commands, amplitude):
+    """Compare cases from never saturated to always saturated."""
     resistance, inductance, _, voltage = WINDINGS[name]
     x = resistance / rate / inductance
     kp, ki = designed_gains(resistance, inductance, 1 / rate, bandwidth * rate)
-    parameters = parameters_type(Drive)(*drive(name, rate).numbers)
+    parameters = parameters_type(Drive)(*drive(name, rate).parameter_values)
     current, integral, stepped, volts = 0.0, 0.0, 0.0, 0.0
     for reference, back_emf in commands:
         reference, back_emf = (
-            (2 * one - 1) * amplitude * voltage for one in (reference, 0.4 * back_emf)
+            (2 * share - 1) * amplitude * voltage for share in (reference, 0.4 * back_emf)
         )
         reference /= resistance
         limits = ((sign * voltage - back_emf) / resistance for sign in (-1, 1))
-        current, integral, total, drawn, _ = jump(
+        current, integral, total, drawn, _ = solve_designed_loop(
             current, integral, reference, *limits, samples, x, bandwidth, -math.expm1(-x)
         )
         winding = (samples, resistance, math.exp(-x), -math.expm1(-x) / x)
@@ -186,26 +198,30 @@ def test_the_closed_form_is_the_stepping(name, rate, bandwidth, samples, command
         assert abs(drawn - expected_drawn) <= 1e-12 * unit**2 * samples
 
 
-def loop_of(one, gains):
-    """Open loop of the current as python-control has it."""
-    motor, time = one.motor, 1 / one.controller.sample_rate
+def loop_of(actuator, gains):
+    """Return python-control's open loop of the current."""
+    motor, time = actuator.motor, 1 / actuator.controller.sample_rate
     kp, ki = gains
     decay = math.exp(-motor.resistance * time / motor.inductance)
-    plant = control.TransferFunction([(1 - decay) / motor.resistance], [1, -decay], time)
+    winding = control.TransferFunction([(1 - decay) / motor.resistance], [1, -decay], time)
     pi = control.TransferFunction([kp + ki, -kp], [1, -1], time)
     return (
-        pi * plant * control.TransferFunction([1], [1, 0] if one.controller.delayed else [1], time)
+        pi
+        * winding
+        * control.TransferFunction([1], [1, 0] if actuator.controller.delayed else [1], time)
     )
 
 
 @every_winding
-def test_the_margins_are_those_of_the_design(name):
-    """Phase margin of some 60 degrees with the delay; the simulated loop's amplitude and phase are those computed."""
+def test_the_margins_match_the_design(name):
+    """Check a phase margin of about 60 degrees with the delay, and the simulated response."""
     rate = 20e3
-    one = drive(name, rate, delayed=True)
-    motor = one.motor
+    actuator = drive(name, rate, delayed=True)
+    motor = actuator.motor
     bandwidth = 2 * math.pi * DEFAULT_BANDWIDTH * rate
-    computed = loop_of(one, designed_gains(motor.resistance, motor.inductance, 1 / rate, bandwidth))
+    computed = loop_of(
+        actuator, designed_gains(motor.resistance, motor.inductance, 1 / rate, bandwidth)
+    )
     gain_margin, phase_margin, *_ = control.margin(computed)
     assert 60 < phase_margin < 70
     assert 3.2 < gain_margin < 3.6
@@ -213,42 +229,45 @@ def test_the_margins_are_those_of_the_design(name):
     for share in (0.3, 1.0, 2.0):
         omega = share * bandwidth
         times = np.arange(400) / rate
-        # one sample a step: a frequency sweep of the loop itself
+        # With one sample per step, this is a frequency sweep of the loop itself.
         torques = 1e-3 * motor.torque_constant * np.sin(omega * times)
-        currents = [step[0].current for step in responses(one, 1 / rate, torques, np.zeros(400))]
+        currents = [
+            step[0].current for step in responses(actuator, 1 / rate, torques, np.zeros(400))
+        ]
         late = slice(200, None)
         basis = np.stack([np.sin(omega * times[late]), np.cos(omega * times[late])], axis=1)
         real, imaginary = np.linalg.lstsq(basis, np.array(currents)[late] / 1e-3, rcond=None)[0]
-        # the state is that at the step's end: one sample ahead
+        # The state is that at the end of the step, one sample ahead.
         expected = closed(np.exp(1j * omega / rate)) * np.exp(1j * omega / rate)
         assert abs(complex(real, imaginary) - expected) < 1e-6
 
 
 @pytest.mark.parametrize(
-    ("anti_windup", "least", "most"),
+    ("anti_windup", "min_delay", "max_delay"),
     [("back_calculation", 0, 1), ("clamping", 0, 3), ("none", 15, 60)],
 )
-def test_after_what_could_not_be_reached_it_recovers_within_a_millisecond_or_not(
-    anti_windup, least, most
-):
-    """20 ms of a current that the voltage cannot make at this speed, then one that it can."""
+def test_recovery_after_saturation_depends_on_the_anti_windup(anti_windup, min_delay, max_delay):
+    """Command a current beyond the voltage at this speed for 20 ms, then a possible one."""
     resistance, _, constant, voltage = WINDINGS["qube"]
-    one, speed = drive("qube", anti_windup=anti_windup), 0.5 * voltage / constant
+    actuator, speed = drive("qube", anti_windup=anti_windup), 0.5 * voltage / constant
     amperes = voltage / resistance * np.array([0.9] * 400 + [0.2] * 2000)
     currents = np.array(
-        [step[0].current for step in responses(one, 1 / 20e3, constant * amperes, [speed] * 2400)]
+        [
+            step[0].current
+            for step in responses(actuator, 1 / 20e3, constant * amperes, [speed] * 2400)
+        ]
     )
     wrong = np.abs(currents[400:] / amperes[400:] - 1.0) > 0.05
-    assert least <= np.flatnonzero(wrong)[-1] / 20 <= most  # [ms]
+    assert min_delay <= np.flatnonzero(wrong)[-1] / 20 <= max_delay  # [ms]
 
 
-def test_the_gear_turns_torque_speed_inertia_and_friction():
+def test_the_gear_converts_torque_speed_inertia_and_friction():
     motor = GearMotor(
         rotor_inertia=2e-6, gear_ratio=10.0, coulomb_friction=1e-3, viscous_friction=1e-5
     )
-    one = Drive(motor)
-    assert one.arm_radius == 0.1
-    np.testing.assert_allclose(one.additions, (2e-4, 1e-3, 1e-2))
+    actuator = Drive(motor)
+    assert actuator.arm_radius == 0.1
+    np.testing.assert_allclose(actuator.additions, (2e-4, 1e-3, 1e-2))
     np.testing.assert_allclose(
         Drive(dataclasses.replace(motor, arm_radius=0.5)).additions, (8e-4, 4e-3, 2e-2)
     )
@@ -261,21 +280,22 @@ def test_the_gear_turns_torque_speed_inertia_and_friction():
         (4e-6, 200.0, 0.01, 0.2 * 0.01),
         (4e-6, 200.0, -0.01, 0.25 * 0.01),
         (0.0, 200.0, 0.01, 0.2 * 0.01),
-        (4e-6, 1e-3, 0.01, 4e-6 * 1e-3 / 0.01),  # near standstill it only stops the rotor
+        # Near standstill friction only stops the rotor.
+        (4e-6, 1e-3, 0.01, 4e-6 * 1e-3 / 0.01),
         *((inertia, 0.0, 0.01, 0.0) for inertia in (4e-6, 0.0)),
     ],
     ids=["driving", "driven", "driving and light", "nearly still", "still", "still and light"],
 )
-def test_a_gear_passes_on_a_share_and_brakes_what_drives_it(inertia, speed, torque, lost, sign):
+def test_a_gear_transmits_a_share_and_brakes_when_it_is_driven(inertia, speed, torque, lost, sign):
     lossy = Drive(GearMotor(gear_efficiency=0.8, rotor_inertia=inertia), supply=Supply(48.0))
     *_, (_, delivered, signals) = responses(lossy, 0.01, [sign * torque] * 5, [sign * speed] * 5)
     assert 0.042 * signals.current == pytest.approx(sign * torque, rel=1e-2)
     assert 0.042 * signals.current - delivered == pytest.approx(sign * lost, rel=1e-2, abs=1e-15)
 
 
-def test_the_largest_current_is_kept():
-    one = drive("qube", max_current=0.3)
-    steps = responses(one, 0.002, [1.0, -1.0, 0.042 * 0.2], [0.0] * 3)
+def test_the_current_limit_holds():
+    actuator = drive("qube", max_current=0.3)
+    steps = responses(actuator, 0.002, [1.0, -1.0, 0.042 * 0.2], [0.0] * 3)
     assert [step[2].reference_current for step in steps] == [0.3, -0.3, pytest.approx(0.2)]
     assert [limits_of(step[2]) for step in steps] == ["current", "current", ""]
     assert abs(steps[0][0].current) <= 0.3
@@ -309,12 +329,12 @@ def test_the_largest_current_is_kept():
         (lambda: Drive(supply=Supply(24.0, 1e4)).check(0.002), r"lower supply\.resistance"),
     ],
 )
-def test_bad_input_is_refused(make, message):
+def test_raises_if_a_field_is_invalid(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
 
-def test_a_datasheet_makes_a_motor():
+def test_a_motor_is_made_from_a_datasheet():
     motor = GearMotor.from_datasheet(
         resistance="0.464 ohm",
         inductance="0.322 mH",
@@ -326,8 +346,8 @@ def test_a_datasheet_makes_a_motor():
     )
 
 
-# name: gear ratio, rotor inertia, and a load [kg*m^2] that is light for it: its speed cannot be
-# held for 20 ms
+# Name: gear ratio, rotor inertia, and a light load [kg*m^2]: with it, the speed cannot be held for
+# 20 ms.
 STIFF = {
     "dcx22l": (35.0, 9.37e-7, 2e-3),
     "ak80-6": (6.0, 6.07e-5, 2e-2),
@@ -335,18 +355,24 @@ STIFF = {
 }
 
 
-def stiff(name, told):
-    """A motor that is told what it moves [kg*m^2]; 0: by the model."""
+def stiff(name, load_inertia):
+    """Return a motor with a specified load inertia [kg*m^2]; 0 means that of the model."""
     resistance, inductance, constant, voltage = WINDINGS[name]
     ratio, inertia, _ = STIFF[name]
     motor = GearMotor(
-        resistance, inductance, constant, constant, inertia, gear_ratio=ratio, load_inertia=told
+        resistance,
+        inductance,
+        constant,
+        constant,
+        inertia,
+        gear_ratio=ratio,
+        load_inertia=load_inertia,
     )
     return Drive(motor, SampledLoop(20e3), Supply(voltage))
 
 
 def links(name, timestep, count):
-    """The spec of links about one another's ends, as light together as is light for a motor."""
+    """Return the spec of links at each other's ends, all as light as `STIFF` says for a motor."""
     spec = mujoco.MjSpec()
     spec.option.timestep, body = timestep, spec.worldbody
     for link in range(count):
@@ -361,15 +387,17 @@ def links(name, timestep, count):
 
 
 def chain(name, timestep, loads, allow_unstable=False):
-    """Links that are each told another load, compiled."""
-    actuators = {f"joint{link}": stiff(name, told) for link, told in enumerate(loads)}
+    """Return a compiled model of links whose motors have different load inertias."""
+    actuators = {
+        f"joint{link}": stiff(name, load_inertia) for link, load_inertia in enumerate(loads)
+    }
     return codrl_mj.add_motors(
         links(name, timestep, len(loads)), actuators, allow_unstable
     ).compile()
 
 
 def reversals(name, timestep, loads, allow_unstable=False):
-    """Speeds [rad/s] of links whose motors are asked back and forth for nearly all they can; and the no-load speed."""
+    """Return the links' speeds [rad/s] under alternating commands, and the no-load speed."""
     resistance, _, constant, voltage = WINDINGS[name]
     ratio = STIFF[name][0]
     model = chain(name, timestep, loads, allow_unstable)
@@ -390,35 +418,35 @@ def reversals(name, timestep, loads, allow_unstable=False):
 
 @pytest.mark.filterwarnings("ignore:motor.rotor_inertia")
 @pytest.mark.parametrize("name", STIFF)
-@pytest.mark.parametrize("told", [False, True], ids=["by the model", "told"])
-def test_a_light_load_turns_as_in_short_steps(name, told):
-    load = STIFF[name][2] if told else 0.0
-    fine, fastest = reversals(name, 5e-5, [math.inf])
+@pytest.mark.parametrize("is_specified", [False, True], ids=["by the model", "specified"])
+def test_a_light_load_moves_as_in_short_steps(name, is_specified):
+    load = STIFF[name][2] if is_specified else 0.0
+    reference, fastest = reversals(name, 5e-5, [math.inf])
     held, _ = reversals(name, 0.02, [math.inf], allow_unstable=True)
-    assert np.abs(held - fine[399::400]).mean() > 0.04 * fastest
+    assert np.abs(held - reference[399::400]).mean() > 0.04 * fastest
     for timestep in (0.002, 0.01, 0.02):
         every = round(timestep / 5e-5)
         followed, _ = reversals(name, timestep, [load])
-        assert np.abs(followed - fine[every - 1 :: every]).mean() < 0.02 * fastest
+        assert np.abs(followed - reference[every - 1 :: every]).mean() < 0.02 * fastest
 
 
 @pytest.mark.filterwarnings("ignore:motor.rotor_inertia")
 @pytest.mark.parametrize("name", STIFF)
-def test_an_arm_of_two_light_links_stays_bounded_at_20_ms_and_is_right_at_2(name):
-    fine, fastest = reversals(name, 5e-5, [math.inf] * 2)
+def test_an_arm_of_two_light_links_is_bounded_at_20_ms_and_accurate_at_2_ms(name):
+    reference, fastest = reversals(name, 5e-5, [math.inf] * 2)
     followed, _ = reversals(name, 0.02, [0.0] * 2)
     assert np.abs(followed).max() < 2.0 * fastest
-    assert np.abs(followed - fine[399::400]).mean() < 0.25 * fastest
+    assert np.abs(followed - reference[399::400]).mean() < 0.25 * fastest
     quick, _ = reversals(name, 0.002, [0.0] * 2)
-    assert np.abs(quick - fine[39::40]).mean() < 0.02 * fastest
+    assert np.abs(quick - reference[39::40]).mean() < 0.02 * fastest
 
 
-def test_a_speed_that_cannot_be_held_is_refused_and_one_that_is_wrong_warned_of():
+def test_raises_if_a_held_speed_is_unstable_and_warns_if_it_is_inaccurate():
     with pytest.raises(
         ValueError, match=r"^a0: .*takes 2\.\d+ of the rotor's speed .* leave motor.load_inertia 0"
     ):
         chain("dcx22l", 0.02, [math.inf])
-    with pytest.warns(UserWarning, match=r"above 0\.5 it is wrong"):
+    with pytest.warns(UserWarning, match=r"above 0\.5 it is inaccurate"):
         chain("1331t", 0.02, [math.inf])
     with pytest.warns(
         UserWarning, match=r"is 22\.4 times the time in which .* steps late: shorten the step"
@@ -431,33 +459,34 @@ def test_a_speed_that_cannot_be_held_is_refused_and_one_that_is_wrong_warned_of(
         light.check_shaft(0.002, 1e-7)
 
 
-def test_a_physics_that_holds_the_speed_over_a_step_judges_it_so():
-    """On MuJoCo the drive follows its speed within the step; Gymnasium's equations hold it."""
+def test_the_analytic_physics_checks_the_speed_held_over_a_step():
+    """Check that MuJoCo predicts the speed within a step, while Gymnasium's equations hold it."""
     drive = Drive(
         GearMotor(0.315, 0.4e-3, 0.0203, 0.0203, 0.0, gear_ratio=120.0),
         SampledLoop(20e3),
         Supply(24.0),
     )
-    assert 0.05 * 120**2 * 0.0203**2 / (0.315 / 3) > 2  # its rod has an inertia of 1/3 kg*m^2
+    # The rod's inertia is 1/3 kg*m^2.
+    assert 0.05 * 120**2 * 0.0203**2 / (0.315 / 3) > 2
     codrl_mj.make("pendulum", drive, inner_steps=1).close()
-    with pytest.raises(ValueError, match=r"over which that is held, must be < 2; shorten the step"):
+    with pytest.raises(ValueError, match=r"during which it is held, must be < 2; shorten the step"):
         codrl_mj.make("pendulum", drive, inner_steps=1, physics="analytic")
 
 
-def test_several_drives_on_a_joint_are_judged_together():
-    """None follows what the others do within a step."""
+def test_drives_on_the_same_joint_are_checked_together():
+    """Check the sum: no drive reacts to the others within a step."""
     spec = links("dcx22l", 0.02, 1)
     spec.add_actuator(name="b", target="joint0", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
-    one = stiff("dcx22l", 0.0)
-    codrl_mj.add_motors(spec, {"a0": one})
+    motor = stiff("dcx22l", 0.0)
+    codrl_mj.add_motors(spec, {"a0": motor})
     with pytest.raises(
-        ValueError, match=r"in 0\.02 s over which that is held, must be < 2; shorten the step"
+        ValueError, match=r"in 0\.02 s during which it is held, must be < 2; shorten the step"
     ):
-        codrl_mj.add_motors(spec, {"a0": one, "b": one})
+        codrl_mj.add_motors(spec, {"a0": motor, "b": motor})
 
 
-def test_a_drive_that_was_switched_off_begins_anew():
-    """What its shaft did meanwhile is not taken for what pushes it."""
+def test_a_drive_forgets_its_estimate_while_it_is_switched_off():
+    """Check that the motion in the meantime is not taken for an external acceleration."""
     model = chain("dcx22l", 0.01, [0.0])
     data, cleared = mujoco.MjData(model), mujoco.MjData(model)
     model.opt.disableactuator = 1
@@ -474,8 +503,8 @@ def test_a_drive_that_was_switched_off_begins_anew():
     np.testing.assert_array_equal(data.actuator_force, cleared.actuator_force)
 
 
-def test_a_winding_far_quicker_than_the_samples_has_gains_too():
-    """exp(R*T/L) is beyond floating point."""
+def test_a_winding_much_faster_than_the_samples_has_finite_gains():
+    """Check a case in which exp(R*T/L) overflows."""
     quick = Drive(
         GearMotor(resistance=20.0, inductance=1e-5), SampledLoop(1e3, delayed=True), Supply(24.0)
     )

@@ -1,4 +1,4 @@
-"""The lag: the exact response to held commands, by scipy."""
+"""Lag: exact response to held commands, against scipy."""
 
 import numpy as np
 import pytest
@@ -20,21 +20,21 @@ from tests.actuators.strategies import between, zero_or
     st.just(0.0) | between(0.01, 1.0),
     between(0.1, 2.0),
 )
-def test_it_is_the_exact_answer_to_the_interpolated_commands(
+def test_the_response_to_interpolated_commands_is_exact(
     commands, step, time_constant, whole, fraction, gain
 ):
-    """Any commands, step, time constant, delay and gain, against scipy's zero-order hold of 1/(1 + T*s).
+    """Compare any commands and parameters with scipy's zero-order hold of 1/(1 + T*s).
 
-    A delay between whole steps mixes its neighbours: a held command that arrives within a step is
-    its mean over it.
+    A delay between whole steps weights the adjacent commands: a held command that arrives within a
+    step counts by its mean over the step.
     """
     lag, count, delay = (
         Lag(time_constant, (whole + fraction) * step, gain),
         len(commands),
         whole + fraction,
     )
-    parameters, state, found = (
-        parameters_type(Lag)(*lag.numbers),
+    parameters, state, torques = (
+        parameters_type(Lag)(*lag.parameter_values),
         lag.State(*[0.0] * len(lag.State._fields)),
         [],
     )
@@ -42,7 +42,7 @@ def test_it_is_the_exact_answer_to_the_interpolated_commands(
         state, torque, _ = lag.advance(
             parameters, step, state, Inputs(command, 0.0, 0.0, index * step, 0.0)
         )
-        found.append(torque)
+        torques.append(torque)
     earlier = np.arange(-HISTORY, count)
     arrived = gain * np.interp(
         np.arange(count) - delay, earlier, np.concatenate([np.zeros(HISTORY), commands])
@@ -54,12 +54,11 @@ def test_it_is_the_exact_answer_to_the_interpolated_commands(
         )
         a, b, *_ = signal.cont2discrete(system, step, "zoh")
         expected = signal.lfilter(b[0], [1.0, -a[0, 0]], arrived)
-    np.testing.assert_allclose(
-        found, expected, atol=1e-7 if fraction else 1e-12
-    )  # 1e-9 of a step is none
+    # A fraction of 1e-9 of a step counts as 0.
+    np.testing.assert_allclose(torques, expected, atol=1e-7 if fraction else 1e-12)
 
 
-def test_delays_longer_than_what_is_remembered_are_refused():
+def test_raises_if_the_delay_exceeds_the_history():
     Lag(delay=HISTORY * 0.01).check(0.01)
     with pytest.raises(
         ValueError, match=r"Lag\.delay = 0\.0801: must be <= 0\.08 s, 8 steps of 0\.01 s"
@@ -67,6 +66,6 @@ def test_delays_longer_than_what_is_remembered_are_refused():
         Lag(delay=0.0801).check(0.01)
 
 
-def test_a_time_constant_in_milliseconds_is_warned_of():
+def test_warns_if_the_time_constant_seems_to_be_in_milliseconds():
     with pytest.warns(UserWarning, match=r"Lag\.time_constant = 50: .*for 50 ms write 0\.05"):
         Lag(50.0).check(0.01)

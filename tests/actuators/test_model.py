@@ -1,4 +1,4 @@
-"""What a family says of itself, and what is made of it: numbers, paths, names."""
+"""Declarations of actuator families, and their parameters, paths and names."""
 
 import dataclasses
 import math
@@ -21,12 +21,12 @@ from codrl_mj.actuators import (
     Lag,
     Motor,
     Supply,
+    family_id,
     family_name,
-    family_number,
     field_paths,
+    import_path,
     parameter_paths,
     parameters_type,
-    reference,
 )
 from codrl_mj.fields import flag, integer, part, real
 from tests.actuators.strategies import of_every_family
@@ -34,15 +34,15 @@ from tests.actuators.strategies import of_every_family
 
 @dataclasses.dataclass(frozen=True)
 class Inner:
-    """A part of a family."""
+    """Part of a family."""
 
-    gain: float = real(1.0, least=0.0)
-    count: int = integer(2, least=1)
+    gain: float = real(1.0, minimum=0.0)
+    count: int = integer(2, minimum=1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Nested(ActuatorModel):
-    """A family with parts, one of which may be absent, and an arm."""
+    """Family with parts, one of which is optional, and an arm."""
 
     arm_radius: float = real(0.5, above=0.0)
     on: bool = flag(True)
@@ -52,40 +52,45 @@ class Nested(ActuatorModel):
 
 @dataclasses.dataclass(frozen=True)
 class Finer(Inner):
-    """A kind of such a part."""
+    """Subclass of such a part."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Open(Nested):
-    """A family that declares less of its parts than it has by default."""
+    """Family that declares a more general part than its default."""
 
     always: Inner = Finer(gain=3.0)
     maybe: Any = part(Inner(gain=4.0))
 
 
-def test_parts_are_what_a_family_declares_and_not_what_it_has_by_default():
+def test_parts_have_the_declared_type_not_that_of_the_default():
     assert Open(always=Inner(), maybe=Supply(12.0)).maybe.voltage == 12.0
     assert Nested(always=Finer(), maybe=None).maybe is None
 
 
 @given(of_every_family)
-def test_numbers_make_the_actuator_again(actuator):
+def test_parameters_round_trip(actuator):
     family = type(actuator)
-    found = family.from_numbers(actuator.numbers, actuator.arm_radius)
-    assert found.numbers == actuator.numbers
-    assert len(actuator.numbers) == len(parameters_type(family)._fields)
-    assert family.from_numbers(np.array(actuator.numbers), actuator.arm_radius) == found
-    if family is Drive:  # the gear's ratio goes into the arm and out again
-        assert found.motor.arm_radius == pytest.approx(actuator.motor.arm_radius, rel=1e-15)
-        found = found.replaced({"motor.arm_radius": actuator.motor.arm_radius})
-    if family in (DCMotorActuator, Drive):  # a supply that says what None does
-        actuator = dataclasses.replace(actuator, supply=found.supply)
-    assert found == actuator
+    copy = family.from_parameter_values(actuator.parameter_values, actuator.arm_radius)
+    assert copy.parameter_values == actuator.parameter_values
+    assert len(actuator.parameter_values) == len(parameters_type(family)._fields)
+    assert (
+        family.from_parameter_values(np.array(actuator.parameter_values), actuator.arm_radius)
+        == copy
+    )
+    # The gear ratio is divided into the arm and multiplied out again.
+    if family is Drive:
+        assert copy.motor.arm_radius == pytest.approx(actuator.motor.arm_radius, rel=1e-15)
+        copy = copy.replaced({"motor.arm_radius": actuator.motor.arm_radius})
+    # The parameters of no supply are those of its default.
+    if family in (DCMotorActuator, Drive):
+        actuator = dataclasses.replace(actuator, supply=copy.supply)
+    assert copy == actuator
 
 
 @given(of_every_family, st.sampled_from([1e-3, 0.002, 0.00123, 0.01, 0.05]))
-def test_what_is_refused_is_what_counts_as_unstable(actuator, timestep):
-    (radius,) = type(actuator).instability(np.array([actuator.numbers]), timestep)
+def test_check_raises_where_instability_is_1_or_more(actuator, timestep):
+    (radius,) = type(actuator).instability(np.array([actuator.parameter_values]), timestep)
     try:
         actuator.check(timestep)
     except ValueError:
@@ -94,19 +99,27 @@ def test_what_is_refused_is_what_counts_as_unstable(actuator, timestep):
         assert radius < 1.0
 
 
-def test_an_absent_part_and_one_of_its_numbers_are_one_actuator():
-    assert DCMotorActuator.from_numbers(DCMotorActuator(supply=Supply()).numbers).supply is None
-    assert Nested().numbers == Nested(maybe=Inner(gain=4.0)).numbers
-    assert Nested.from_numbers(Nested(maybe=Inner(5.0)).numbers, 0.5) == Nested(maybe=Inner(5.0))
-    found = Nested.from_numbers((0.0, 2.0, 7.0, 4.0, 2.0), 0.25)
-    assert found == Nested(0.25, False, Inner(2.0, 7))
-    assert (type(found.always.count), found.on) == (
+def test_a_missing_part_equals_its_default():
+    assert (
+        DCMotorActuator.from_parameter_values(
+            DCMotorActuator(supply=Supply()).parameter_values
+        ).supply
+        is None
+    )
+    assert Nested().parameter_values == Nested(maybe=Inner(gain=4.0)).parameter_values
+    assert Nested.from_parameter_values(Nested(maybe=Inner(5.0)).parameter_values, 0.5) == Nested(
+        maybe=Inner(5.0)
+    )
+    actuator = Nested.from_parameter_values((0.0, 2.0, 7.0, 4.0, 2.0), 0.25)
+    assert actuator == Nested(0.25, False, Inner(2.0, 7))
+    # Integers and flags are restored.
+    assert (type(actuator.always.count), actuator.on) == (
         int,
         False,
-    )  # whole numbers and flags come back as such
+    )
 
 
-def test_paths_are_those_of_all_fields_and_parameters_all_but_the_arm():
+def test_paths_cover_all_fields_and_parameters_all_but_the_arm():
     assert field_paths(Nested) == (
         "arm_radius",
         "on",
@@ -122,7 +135,7 @@ def test_paths_are_those_of_all_fields_and_parameters_all_but_the_arm():
         "maybe_gain": "maybe.gain",
         "maybe_count": "maybe.count",
     }
-    assert Nested(on=False, always=Inner(2.0, 7)).numbers == (0.0, 2.0, 7.0, 4.0, 2.0)
+    assert Nested(on=False, always=Inner(2.0, 7)).parameter_values == (0.0, 2.0, 7.0, 4.0, 2.0)
     assert parameters_type(DCMotorActuator)._fields[:2] == ("resistance", "inductance")
     assert field_paths(type(IDEAL)) == ()
     assert parameters_type(type(IDEAL))._fields == ()
@@ -130,14 +143,14 @@ def test_paths_are_those_of_all_fields_and_parameters_all_but_the_arm():
 
 @dataclasses.dataclass(frozen=True)
 class Twice(ActuatorModel):
-    """A family that has a name twice."""
+    """Family with two parameters of the same name."""
 
     gain: float = real(1.0)
     inner: Inner = Inner()
 
 
-LOOP = parameters_type(DCMotorActuator)(*DCMotorActuator().numbers)
-LEAST = {  # field: the least that it may be, or what it must be more than
+LOOP = parameters_type(DCMotorActuator)(*DCMotorActuator().parameter_values)
+BOUNDS = {  # field: its minimum, or its exclusive lower bound
     "Motor": {
         ">": ("resistance", "inductance", "torque_constant", "arm_radius"),
         ">=": ("back_emf_constant",),
@@ -159,13 +172,13 @@ LEAST = {  # field: the least that it may be, or what it must be more than
 BOUNDS = [
     (kind, field, sign)
     for kind in (Motor, CurrentLoop, Supply)
-    for sign, fields in LEAST[kind.__name__].items()
+    for sign, fields in BOUNDS[kind.__name__].items()
     for field in fields
 ]
 
 
 @pytest.mark.parametrize(("kind", "field", "sign"), BOUNDS)
-def test_quantities_have_their_bounds(kind, field, sign):
+def test_fields_have_bounds(kind, field, sign):
     assert getattr(kind(**{field: 1e-9}), field) == 1e-9
     if sign == ">=":
         assert getattr(kind(**{field: 0}), field) == 0.0
@@ -173,11 +186,11 @@ def test_quantities_have_their_bounds(kind, field, sign):
     refused = [-1e-9, -math.inf, math.nan, *[0.0] * (sign == ">"), *[math.inf] * (not infinite)]
     assert not infinite or getattr(kind(**{field: math.inf}), field) == math.inf
     for value in refused:
-        said = (
+        message = (
             f"{kind.__name__}.{field} = {value!r}: must be {'a' if infinite else 'a finite'} number"
             f" {sign} 0"
         )
-        with pytest.raises(ValueError, match=f"^{re.escape(said)}$"):
+        with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
             kind(**{field: value})
 
 
@@ -208,27 +221,30 @@ def test_quantities_have_their_bounds(kind, field, sign):
             r"CurrentLoop\.bemf_compensation = 1: must be true or false",
         ),
         (lambda: Lag(gain=0.0), r"Lag\.gain = 0\.0: must be a finite number > 0"),
-        (lambda: Nested.from_numbers((0.0,) * 3), "zip"),
-        (lambda: Nested.from_numbers((0.0,) * 6), "zip"),
+        (lambda: Nested.from_parameter_values((0.0,) * 3), "zip"),
+        (lambda: Nested.from_parameter_values((0.0,) * 6), "zip"),
         (
-            lambda: Nested.from_numbers((0.5, 2.0, 7.0, 4.0, 2.0)),
+            lambda: Nested.from_parameter_values((0.5, 2.0, 7.0, 4.0, 2.0)),
             r"Nested\.on = 0\.5: must be true or false",
         ),
-        (lambda: DCMotorActuator.from_numbers(LOOP._replace(substeps=1.5)), r"\.substeps = 1\.5"),
         (
-            lambda: DCMotorActuator.from_numbers(LOOP._replace(substeps=math.inf)),
+            lambda: DCMotorActuator.from_parameter_values(LOOP._replace(substeps=1.5)),
+            r"\.substeps = 1\.5",
+        ),
+        (
+            lambda: DCMotorActuator.from_parameter_values(LOOP._replace(substeps=math.inf)),
             r"\.substeps = inf",
         ),
         (
-            lambda: DCMotorActuator.from_numbers(LOOP._replace(bemf_compensation=2.0)),
+            lambda: DCMotorActuator.from_parameter_values(LOOP._replace(bemf_compensation=2.0)),
             r"\.bemf_compensation = 2",
         ),
         (
-            lambda: DCMotorActuator.from_numbers(LOOP._replace(supply_resistance=-1.0)),
+            lambda: DCMotorActuator.from_parameter_values(LOOP._replace(supply_resistance=-1.0)),
             r"Supply\.resistance = -1\.0",
         ),
         (
-            lambda: DCMotorActuator.from_numbers(LOOP, 0.0),
+            lambda: DCMotorActuator.from_parameter_values(LOOP, 0.0),
             r"Motor\.arm_radius = 0\.0: must be a finite number > 0",
         ),
         (
@@ -245,12 +261,12 @@ def test_quantities_have_their_bounds(kind, field, sign):
         ),
     ],
 )
-def test_what_is_no_actuator_is_refused_with_field_value_and_bound(make, message):
+def test_raises_with_field_value_and_bound(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
 
-def test_a_current_loop_by_default_is_the_papers_motor_under_a_proportional_gain():
+def test_the_default_is_the_papers_motor_with_a_proportional_gain():
     assert Motor() == Motor(1.0, 0.1, 1.0, 1.0, 1.0)
     loop = CurrentLoop()
     assert (loop.ki, loop.kd, loop.kff, loop.integral_leak, loop.derivative_time_constant) == (
@@ -271,7 +287,7 @@ def test_a_current_loop_by_default_is_the_papers_motor_under_a_proportional_gain
         loop.ki = 2.0
 
 
-def test_fields_are_replaced_by_their_path():
+def test_fields_are_replaced_by_path():
     base = DCMotorActuator(Motor(resistance=2.0), CurrentLoop(kp=3.0))
     changed = base.replaced(
         {"motor.inductance": 0.2, "controller.substeps": 4.0, "controller.bemf_compensation": 0.0}
@@ -281,44 +297,43 @@ def test_fields_are_replaced_by_their_path():
     assert Lag(0.1).replaced({"delay": 0.2}) == Lag(0.1, 0.2)
     assert DCMotorActuator(supply=Supply()).replaced({"supply.voltage": 12.0}).supply == Supply(
         voltage=12.0
+        # The other values are those that no supply stands for.
     )
-    assert base.replaced({"supply.voltage": 12.0}).supply == Supply(
-        voltage=12.0
-    )  # over what no supply stands for
+    assert base.replaced({"supply.voltage": 12.0}).supply == Supply(voltage=12.0)
     assert base.replaced({}) == base
 
 
-def test_a_family_of_ours_has_its_name_and_anybody_elses_its_place_whatever_name_it_takes():
+def test_only_built_in_families_are_found_by_their_name():
     @dataclasses.dataclass(frozen=True)
     class Impostor(ActuatorModel):
         family = "lag"
 
     assert [family_name(family) for family in FAMILIES.values()] == [*FAMILIES]
-    assert family_name(Nested) == reference(Nested) == f"{__name__}:Nested"
-    assert family_name(Impostor) == reference(Impostor) != "lag"
+    assert family_name(Nested) == import_path(Nested) == f"{__name__}:Nested"
+    assert family_name(Impostor) == import_path(Impostor) != "lag"
 
 
-def test_numbers_of_families_have_six_digits_and_differ():
-    numbers = [family_number(family) for family in (*FAMILIES.values(), Nested, Open)]
+def test_family_ids_have_six_digits_and_differ():
+    numbers = [family_id(family) for family in (*FAMILIES.values(), Nested, Open)]
     assert len({*numbers}) == len(numbers)
     assert all(0 <= number < 10**6 and float(f"{number:.6g}") == number for number in numbers)
 
 
-def test_the_defaults_are_those_of_an_actuator_without_gear_electrics_and_chance():
+def test_the_defaults_suit_an_actuator_without_gear_electrics_and_noise():
     @dataclasses.dataclass(frozen=True)
-    class Least(ActuatorModel):
+    class Minimal(ActuatorModel):
         pass
 
-    least = Least()
-    assert least.arm_radius == 1.0
-    assert least.additions == (0.0, 0.0, 0.0)
-    assert least.winding is None
-    assert least.voltage_limit is None
-    assert not least.random
-    assert least.commands() == {}
-    assert least.check(0.01) is None
-    np.testing.assert_array_equal(Least.instability(np.empty((3, 0)), 0.01), [0.0, 0.0, 0.0])
+    minimal = Minimal()
+    assert minimal.arm_radius == 1.0
+    assert minimal.additions == (0.0, 0.0, 0.0)
+    assert minimal.winding is None
+    assert minimal.voltage_limit is None
+    assert not minimal.random
+    assert minimal.commands() == {}
+    assert minimal.check(0.01) is None
+    np.testing.assert_array_equal(Minimal.instability(np.empty((3, 0)), 0.01), [0.0, 0.0, 0.0])
     rest = Inputs(0.0, 0.0, 0.0, 0.0, 0.0)
-    for function in (Least.advance, Least.observe):
+    for function in (Minimal.advance, Minimal.observe):
         with pytest.raises(NotImplementedError):
-            function((), 0.01, least.State(), rest)
+            function((), 0.01, minimal.State(), rest)

@@ -1,4 +1,4 @@
-"""Names of actuators and families, and whatever else may be written for an actuator."""
+"""Actuators and families by name, and all other ways to specify an actuator."""
 
 import dataclasses
 import json
@@ -22,13 +22,13 @@ from codrl_mj.actuators import (
     Supply,
     TorqueSpeed,
     actuator_from_mapping,
-    actuator_over,
     check_same_family,
+    display_label,
+    display_name,
     find_family,
-    label_of,
     mapping_of,
-    name_of,
     named_mapping,
+    override_actuator,
     resolve,
     set_display_name,
 )
@@ -43,7 +43,7 @@ CARTPOLE = TASKS["cartpole"]
 
 @dataclasses.dataclass(frozen=True)
 class Mine(ActuatorModel):
-    """A family of somebody else's."""
+    """Custom family."""
 
     family = "mine"
     strength: float = real(2.0, above=0.0)
@@ -55,7 +55,7 @@ class Mine(ActuatorModel):
 
 MINE = Mine(3.0)
 
-# arXiv 2507.00268, Experimental Results: kP, kI, kD, kFF, arm
+# arXiv 2507.00268, Experimental Results: kP, kI, kD, kFF, arm.
 PAPER_GAINS = {
     "pendulum": (1.0, 20.0, 1e-6, 0.0, 1.0),
     "mountain_car": (1.0, 1.0, 1e-2, 0.0, 1.0),
@@ -66,7 +66,7 @@ PAPER_GAINS = {
 
 
 @every_rebuilt
-def test_named_actuators_are_the_papers_motor_and_gains_and_variations_of_them(task):
+def test_named_actuators_are_the_papers_actuator_and_its_variations(task):
     kp, ki, kd, kff, arm = PAPER_GAINS[task]
     motor = Motor(
         resistance=1.0, inductance=0.1, torque_constant=1.0, back_emf_constant=1.0, arm_radius=arm
@@ -75,7 +75,7 @@ def test_named_actuators_are_the_papers_motor_and_gains_and_variations_of_them(t
         "paper": DCMotorActuator(motor, CurrentLoop(kp, ki, kd, kff, max_voltage=24.0)),
         "weak": DCMotorActuator(motor, CurrentLoop(kp=1.0, ki=1.0)),
         "weaker": DCMotorActuator(motor, CurrentLoop(kp=0.2, ki=0.2)),
-        # u = R*i_ref is the voltage at which i_ref is at rest
+        # At this voltage, u = R*i_ref, the current i_ref is at rest.
         "open_loop": DCMotorActuator(
             dataclasses.replace(motor, inductance=0.5), CurrentLoop(kp=0.0, kff=motor.resistance)
         ),
@@ -86,9 +86,9 @@ def test_named_actuators_are_the_papers_motor_and_gains_and_variations_of_them(t
         named_actuator(name, task).check(TASKS[task].step_duration / TASKS[task].motor_inner_steps)
 
 
-# -- several motors -----------------------------------------------------------------------------------------
+# -- several motors --------------------------------------------------------------------------------
 
-# -- whatever may be written --------------------------------------------------------------------------------
+# -- all ways to specify an actuator ---------------------------------------------------------------
 
 FED = DCMotorActuator(Motor(resistance=3.0), supply=Supply(12.0, 0.5))
 BY_HAND = "motor: {resistance: 2}\ncontroller:\n  kp: 1.5  # V/A\n  max_voltage: .inf\n"
@@ -127,7 +127,7 @@ WRONG_FILES = {
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
-    """The files above, and a motor's own: a copy of one of the catalogue."""
+    """Create the files above, and a motor file copied from the catalogue."""
     for name, text in (FILES | WRONG_FILES).items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
@@ -136,18 +136,18 @@ def files(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     before = set(sys.modules)
     yield
-    for name in {one for one in sys.modules if one.startswith("slipped")} - before:
+    for name in {module for module in sys.modules if module.startswith("slipped")} - before:
         del sys.modules[name]
 
 
 def over(part, **fields):
-    """The cart-pole's weak actuator with some fields of its own."""
+    """Return the cart-pole's weak actuator with some fields changed."""
     weak = DCMotorActuator(CARTPOLE.paper[0].motor, CurrentLoop(kp=1.0, ki=1.0))
     return dataclasses.replace(weak, **{part: dataclasses.replace(getattr(weak, part), **fields)})
 
 
 @pytest.mark.parametrize(
-    ("given", "made"),
+    ("setting", "expected"),
     [
         (FED, FED),
         (FED.as_mapping(), FED),
@@ -173,16 +173,20 @@ def over(part, **fields):
         ({"name": "weak", "controller": {"kp": 5.0}}, over("controller", kp=5.0)),
     ],
 )
-def test_an_actuator_is_made_of_whatever_may_be_written(files, given, made):
-    assert resolve_actuators(given, CARTPOLE) == resolve_actuators([given], CARTPOLE) == (made,)
-    assert given is not FED or resolve_actuators(given, CARTPOLE)[0] is FED
+def test_every_way_to_specify_an_actuator_works(files, setting, expected):
+    assert (
+        resolve_actuators(setting, CARTPOLE)
+        == resolve_actuators([setting], CARTPOLE)
+        == (expected,)
+    )
+    assert setting is not FED or resolve_actuators(setting, CARTPOLE)[0] is FED
 
 
 BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("setting", "message"),
     [
         (
             "papr",
@@ -263,7 +267,7 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
             {"family": "slipped.other:Mine"},
             r"'Mine'; must be module:NAME; did you mean 'MINES'\? .*other\.py",
         ),
-        (f"{__name__}:CARTPOLE", "is neither an actuator nor a family of them"),
+        (f"{__name__}:CARTPOLE", "must be an actuator or a family of actuators"),
         (f"{__name__}:MIEN", "has no attribute 'MIEN'; must be module:NAME"),
         ("nowhere_at_all:MINE", "No module named 'nowhere_at_all'"),
         (":", "must be module:NAME"),
@@ -275,7 +279,7 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
         *((name, rf"^{name}: ") for name in WRONG_FILES),
         (
             {"name": "ideal", "motor": {"resistance": 1.0}},
-            "the ideal actuator has no motor and no controller to",
+            "the ideal actuator has no motor and no controller whose",
         ),
         (
             {"name": "paper", "motor": {"resistence": 1.0}},
@@ -284,24 +288,24 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
         ({"name": "lag", "delay": -1}, r"Lag\.delay = -1"),
     ],
 )
-def test_what_describes_no_actuator_is_refused_with_the_reason(files, given, message):
+def test_raises_with_the_reason_if_a_setting_is_no_actuator(files, setting, message):
     with pytest.raises(ValueError, match=message):
-        resolve_actuators(given, CARTPOLE)
+        resolve_actuators(setting, CARTPOLE)
 
 
 @pytest.mark.parametrize("name", ["paper", "weak", "open_loop", "over.yaml"])
-def test_a_task_without_a_papers_actuator_has_no_variations_of_it(files, name):
+def test_raises_if_a_task_has_no_paper_actuator_to_vary(files, name):
     with pytest.raises(
-        ValueError, match=r"actuator = '\w+': .* of which bare has none; known are current_loop"
+        ValueError, match=r"actuator = '\w+': .* but bare has none; known names: current_loop"
     ):
         resolve_actuators(name, BARE)
     assert resolve_actuators("ideal", BARE) == (IDEAL,)
     assert resolve_actuators("lag", BARE) == (Lag(),)
 
 
-def test_a_file_that_is_not_there_is_refused_with_its_name():
+def test_raises_with_the_name_of_a_missing_file():
     with pytest.raises(FileNotFoundError, match=r"no actuator file at none\.yaml"):
-        resolve("none.yaml", None, "nobody")
+        resolve("none.yaml", None, "the task")
 
 
 PAIR = dataclasses.replace(
@@ -313,7 +317,7 @@ PAIR = dataclasses.replace(
 )
 
 
-def test_every_motor_has_its_own_variation_of_its_own_actuator():
+def test_every_motor_has_a_variation_of_its_own_paper_actuator():
     for name, gain in (("weak", 1.0), ("weaker", 0.2)):
         loop = CurrentLoop(kp=gain, ki=gain)
         assert resolve_actuators(name, PAIR) == tuple(
@@ -325,48 +329,48 @@ def test_every_motor_has_its_own_variation_of_its_own_actuator():
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("setting", "message"),
     [
         (["paper"], r"1 actuators, but pair has 2 motors \(left, right\)"),
         (["paper"] * 3, r"3 actuators, but pair has 2 motors \(left, right\)"),
-        (["paper", Lag()], r"actuators of several families \(Actuator, Lag\)"),
+        (["paper", Lag()], r"actuators of several families \(DCMotorActuator, Lag\)"),
     ],
 )
-def test_as_many_actuators_as_motors_and_of_one_family(given, message):
+def test_raises_if_actuators_do_not_match_the_motors(setting, message):
     with pytest.raises(ValueError, match=message):
-        resolve_actuators(given, PAIR)
+        resolve_actuators(setting, PAIR)
 
 
-# -- families -----------------------------------------------------------------------------------------------
+# -- families --------------------------------------------------------------------------------------
 
 
 @given(of_every_family)
-def test_every_family_survives_its_mapping_and_json(actuator):
+def test_mappings_round_trip_through_json(actuator):
     mapping = actuator.as_mapping()
     assert actuator_from_mapping(mapping) == actuator
     assert actuator_from_mapping(json.loads(json.dumps(mapping))) == actuator
     saved = mapping_of(actuator)
     assert (saved is None) == (actuator == IDEAL)
-    assert resolve(json.loads(json.dumps(saved)), None, "nobody") == actuator
+    assert resolve(json.loads(json.dumps(saved)), None, "the task") == actuator
 
 
-def test_a_family_is_found_by_its_name_and_by_its_place():
+def test_a_family_is_found_by_name_and_import_path():
     for name, family in FAMILIES.items():
         assert find_family(name) is find_family(f"{family.__module__}:{family.__name__}") is family
         assert name == family.family
 
 
-# -- what an actuator is called -------------------------------------------------------------------------------
+# -- display names -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("given", "name"),
+    ("setting", "name"),
     [
         (None, "ideal"),
         ("weaker", "weaker"),
         ({"name": "weaker", "controller": {"kp": 9.0}}, "custom"),
         ("lag", "lag"),
-        ("drive", "quanser-qube-servo-2"),  # whose numbers are the defaults
+        ("drive", "quanser-qube-servo-2"),  # the defaults are the fields of this motor
         ("kraken-x60", "kraken-x60"),
         ({"name": "kraken-x60", "motor": {"gear_ratio": 70.3, "arm_radius": 200}}, "kraken-x60"),
         (
@@ -384,28 +388,28 @@ def test_a_family_is_found_by_its_name_and_by_its_place():
         (f"{__name__}:Mine", f"{__name__}:Mine"),
     ],
 )
-def test_an_actuator_is_called_what_it_was_asked_for_by(files, given, name):
-    made = resolve(given, CARTPOLE.paper[0], "cartpole")
-    assert name_of(made, CARTPOLE.paper[0]) == name
-    again = resolve(json.loads(json.dumps(named_mapping(made))), None, "nobody")
-    assert again == made
-    assert label_of(again) == label_of(made)
+def test_an_actuator_is_displayed_by_its_setting(files, setting, name):
+    actuator = resolve(setting, CARTPOLE.paper[0], "cartpole")
+    assert display_name(actuator, CARTPOLE.paper[0]) == name
+    copy = resolve(json.loads(json.dumps(named_mapping(actuator))), None, "the task")
+    assert copy == actuator
+    assert display_label(copy) == display_label(actuator)
 
 
-def test_a_motor_of_the_catalogue_is_known_by_its_numbers_and_written_short():
-    there = resolve("kraken-x60", None, "nobody")
+def test_a_catalogue_motor_is_recognized_by_its_fields_and_written_briefly():
+    base = resolve("kraken-x60", None, "the task")
     geared = dataclasses.replace(
-        there, motor=dataclasses.replace(there.motor, gear_ratio=70.3, arm_radius=200.0)
+        base, motor=dataclasses.replace(base.motor, gear_ratio=70.3, arm_radius=200.0)
     )
-    assert label_of(geared) == ""
-    assert name_of(geared) == "kraken-x60"
+    assert display_label(geared) == ""
+    assert display_name(geared) == "kraken-x60"
     assert named_mapping(set_display_name(geared, "kraken-x60")) == {
         "name": "kraken-x60",
         "motor": {"gear_ratio": 70.3, "arm_radius": 200.0},
     }
-    other = dataclasses.replace(there, motor=dataclasses.replace(there.motor, resistance=1.0))
-    assert name_of(other) == "drive"
-    assert named_mapping(set_display_name(other, "kraken-x60")) == {
+    changed = dataclasses.replace(base, motor=dataclasses.replace(base.motor, resistance=1.0))
+    assert display_name(changed) == "drive"
+    assert named_mapping(set_display_name(changed, "kraken-x60")) == {
         "name": "kraken-x60",
         "motor": {"resistance": 1.0},
     }
@@ -415,47 +419,54 @@ def test_a_motor_of_the_catalogue_is_known_by_its_numbers_and_written_short():
     }
 
 
-def test_a_name_is_nothing_of_the_actuator(files):
-    asked, plain = resolve("drawer.toml", None, "nobody"), resolve("maxon-re65", None, "nobody")
-    assert (name_of(asked), name_of(plain)) == ("drawer", "maxon-re65")
-    assert (asked, hash(asked), asked.as_mapping()) == (plain, hash(plain), plain.as_mapping())
-    assert (
-        label_of(set_display_name(IDEAL, "nothing")) == label_of(MINE) == ""
-    )  # which may be known by other names
+def test_a_display_name_does_not_affect_equality_hash_or_mapping(files):
+    labelled, plain = (
+        resolve("drawer.toml", None, "the task"),
+        resolve("maxon-re65", None, "the task"),
+    )
+    assert (display_name(labelled), display_name(plain)) == ("drawer", "maxon-re65")
+    assert (labelled, hash(labelled), labelled.as_mapping()) == (
+        plain,
+        hash(plain),
+        plain.as_mapping(),
+    )
+    # The same motor may have several display names.
+    assert display_label(set_display_name(IDEAL, "nothing")) == display_label(MINE) == ""
 
 
-# -- places and files ---------------------------------------------------------------------------------------
+# -- import paths and files ------------------------------------------------------------------------
 
 
-# -- single fields over another actuator ----------------------------------------------------------------------
+# -- changes of single fields --------------------------------------------------------------------
 
 
-def test_single_fields_are_set_over_anothers():
+def test_single_fields_of_an_actuator_are_changed():
     base = DCMotorActuator(Motor(resistance=2.0), CurrentLoop(kp=3.0, ki=4.0))
-    changed = actuator_over(base, {"controller": {"kp": 5.0}, "motor": {"inductance": 0.3}})
+    changed = override_actuator(base, {"controller": {"kp": 5.0}, "motor": {"inductance": 0.3}})
     assert changed == DCMotorActuator(
         Motor(resistance=2.0, inductance=0.3), CurrentLoop(kp=5.0, ki=4.0)
     )
-    assert actuator_over(base, {"supply": {"voltage": 12.0}}).supply == Supply(voltage=12.0)
+    assert override_actuator(base, {"supply": {"voltage": 12.0}}).supply == Supply(voltage=12.0)
     assert (
-        actuator_over(DCMotorActuator(supply=Supply(12.0)), {"supply": None}) == DCMotorActuator()
+        override_actuator(DCMotorActuator(supply=Supply(12.0)), {"supply": None})
+        == DCMotorActuator()
     )
-    assert actuator_over(changed, {}) is changed
-    assert actuator_over(Lag(0.1, 0.2), {"delay": 0.3}) == Lag(0.1, 0.3)
-    assert actuator_over(TorqueSpeed(), {"max_torque": 2.0}) == TorqueSpeed(max_torque=2.0)
-    assert actuator_over(IDEAL, {"motor": {}}) is IDEAL
+    assert override_actuator(changed, {}) is changed
+    assert override_actuator(Lag(0.1, 0.2), {"delay": 0.3}) == Lag(0.1, 0.3)
+    assert override_actuator(TorqueSpeed(), {"max_torque": 2.0}) == TorqueSpeed(max_torque=2.0)
+    assert override_actuator(IDEAL, {"motor": {}}) is IDEAL
 
 
-def test_a_part_that_is_given_in_part_is_over_what_stands_for_it():
-    """A drive without a supply has 24 V; one that is told its supply's resistance alone has them as well."""
+def test_missing_fields_of_an_optional_part_take_its_defaults():
+    """Check that a supply has 24 V by default, also if only its resistance is specified."""
     for drive in ({"family": "drive"}, {"name": "maxon-ec45-flat-339285"}):
-        there = resolve({**drive, "supply": {"resistance": 0.5}}, None, "x")
-        assert there.supply == Supply(24.0, 0.5)
+        drive_actuator = resolve({**drive, "supply": {"resistance": 0.5}}, None, "x")
+        assert drive_actuator.supply == Supply(24.0, 0.5)
     assert resolve({"supply": {"resistance": 0.5}}, None, "x").supply == Supply(resistance=0.5)
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("setting", "assumption"),
     [
         (
             {"family": "drive", "motor": {"torque_constant": 0.007}},
@@ -471,6 +482,9 @@ def test_a_part_that_is_given_in_part_is_over_what_stands_for_it():
         ),
     ],
 )
-def test_a_default_that_cuts_what_is_given_is_said(given, said):
-    assert said in resolve(given, None, "x").assumed
-    assert said not in resolve({"family": given.get("family", "current_loop")}, None, "x").assumed
+def test_a_default_that_limits_a_specified_value_is_reported(setting, assumption):
+    assert assumption in resolve(setting, None, "x").assumed
+    assert (
+        assumption
+        not in resolve({"family": setting.get("family", "current_loop")}, None, "x").assumed
+    )

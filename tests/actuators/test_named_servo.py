@@ -1,4 +1,4 @@
-"""A motor by name as a servo: its error under a load against the closed form, and what is said where it cannot be."""
+"""Servos made from named motors: error under a load against the closed form, and error messages."""
 
 import dataclasses
 import json
@@ -16,10 +16,10 @@ from codrl_mj.actuators import (
     Drive,
     Servo,
     ServoLoop,
-    actuator_over,
-    label_of,
-    name_of,
+    display_label,
+    display_name,
     named_mapping,
+    override_actuator,
     resolve,
 )
 from codrl_mj.cli import main
@@ -49,7 +49,7 @@ torque_constant = "36 mNm/A"
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
-    """A datasheet, an actuator as `codrl-mj identify` writes it, and servos of both by name."""
+    """Create a datasheet, an actuator as written by `codrl-mj identify`, and servos of both."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sheet.toml").write_text(DATASHEET)
     fields = {
@@ -62,7 +62,7 @@ def files(tmp_path, monkeypatch):
 
 
 def settled(actuator, target):
-    """The joint's position [rad] and the load [N*m] on it there, after two seconds."""
+    """Return the joint's position [rad] and its load [N*m] after two seconds."""
     model = codrl_mj.add_motors(mujoco.MjSpec.from_string(ARM), {"kn.*": actuator}).compile()
     data = mujoco.MjData(model)
     data.ctrl[0] = target
@@ -71,9 +71,7 @@ def settled(actuator, target):
 
 
 @pytest.mark.parametrize("name", [MOTOR, "sheet.toml", "identified.yaml"])
-def test_a_motor_by_name_sags_under_a_load_by_the_closed_form_and_is_the_servo_of_its_parts(
-    files, name
-):
+def test_a_named_motor_becomes_a_servo_whose_error_under_load_is_the_closed_form(files, name):
     drive = resolve(name, None, "x")
     motor = dataclasses.replace(drive.motor, gear_ratio=50.0, coulomb_friction=0.0)
     parts = Servo(
@@ -86,49 +84,51 @@ def test_a_motor_by_name_sags_under_a_load_by_the_closed_form_and_is_the_servo_o
 
 
 @pytest.mark.parametrize("name", ["sheet.toml", "identified.yaml"])
-def test_a_file_may_make_a_servo_of_another_file(files, name):
+def test_a_file_can_make_a_servo_of_another_file(files, name):
     assert resolve(f"servo_{name[:5]}.yaml", None, "x") == resolve(
         SERVO | {"name": name}, None, "x"
     )
 
 
-def test_a_servo_without_a_gain_gets_ten_times_the_slope_of_its_motor_and_says_so():
-    made = resolve({"name": MOTOR, "family": "servo", "motor": {"gear_ratio": 20.0}}, None, "x")
+def test_a_servo_without_a_gain_gets_the_default_gain_and_reports_it():
+    servo = resolve({"name": MOTOR, "family": "servo", "motor": {"gear_ratio": 20.0}}, None, "x")
     motor = resolve(MOTOR, None, "x").motor
     slope = motor.torque_constant * motor.back_emf_constant / motor.resistance * 20.0**2
-    assert made.loop.velocity_gain == pytest.approx(10.0 * slope, rel=5e-3)  # three digits
-    assert made.loop == ServoLoop(velocity_gain=made.loop.velocity_gain)
-    assert f"loop.velocity_gain = {made.loop.velocity_gain:g} N*m*s/rad" in made.assumed
+    # The gain is rounded to three digits.
+    assert servo.loop.velocity_gain == pytest.approx(10.0 * slope, rel=5e-3)
+    assert servo.loop == ServoLoop(velocity_gain=servo.loop.velocity_gain)
+    assert f"loop.velocity_gain = {servo.loop.velocity_gain:g} N*m*s/rad" in servo.assumed
     assert "loop" not in resolve(SERVO, None, "x").assumed
     assert "loop.velocity_gain = 0.1" in Servo().assumed
 
 
-def test_a_servo_becomes_its_drive_again_and_keeps_its_name():
-    made, drive = resolve(SERVO, None, "x"), resolve(MOTOR, None, "x")
-    assert name_of(made) == f"{MOTOR} servo, changed"  # another friction
-    plain = actuator_over(drive, {"family": "servo", "loop": ServoLoop(velocity_gain=2.0)})
+def test_a_servo_becomes_a_drive_again_and_keeps_its_name():
+    servo, drive = resolve(SERVO, None, "x"), resolve(MOTOR, None, "x")
+    # Its friction was changed.
+    assert display_name(servo) == f"{MOTOR} servo, changed"
+    plain = override_actuator(drive, {"family": "servo", "loop": ServoLoop(velocity_gain=2.0)})
     assert plain == Servo(drive.motor, drive.controller, drive.supply, ServoLoop(velocity_gain=2.0))
-    assert actuator_over(drive, {"family": Servo, "loop": {"velocity_gain": 2.0}}) == plain
-    again = actuator_over(plain, {"family": "drive"})
-    assert (type(again), again, label_of(plain), label_of(again)) == (
+    assert override_actuator(drive, {"family": Servo, "loop": {"velocity_gain": 2.0}}) == plain
+    again = override_actuator(plain, {"family": "drive"})
+    assert (type(again), again, display_label(plain), display_label(again)) == (
         Drive,
         drive,
         f"{MOTOR} servo",
         MOTOR,
     )
     read = resolve(json.loads(json.dumps(named_mapping(plain))), None, "x")
-    assert (read, label_of(read)) == (plain, label_of(plain))
+    assert (read, display_label(read)) == (plain, display_label(plain))
 
 
 @pytest.mark.parametrize("controls", ["position", "velocity"])
-def test_an_agent_asks_a_motor_by_name_for_either(controls):
-    given = {
+def test_an_agent_commands_positions_or_speeds_of_a_named_motor(controls):
+    setting = {
         "name": MOTOR,
         "family": "servo",
         "motor": {"gear_ratio": 20.0},
         "loop": {"controls": controls},
     }
-    env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=given, action=controls)
+    env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=setting, action=controls)
     free = 24.0 / resolve(MOTOR, None, "x").motor.back_emf_constant / 20.0
     assert env.action_space.high == pytest.approx(
         {"position": math.pi, "velocity": free}[controls], rel=1e-6
@@ -136,12 +136,13 @@ def test_an_agent_asks_a_motor_by_name_for_either(controls):
     env.reset(seed=0)
     for _ in range(40):
         *_, info = env.step(np.array([0.5], np.float32))
-    gain = resolve(given, None, "x").loop.velocity_gain  # the pendulum's weight makes at most 5 N*m
+    # The pendulum's weight is at most 5 N*m.
+    gain = resolve(setting, None, "x").loop.velocity_gain
     assert 0.0 < abs(info["error"]) <= 5.0 / gain / {"position": 20.0, "velocity": 1.0}[controls]
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("setting", "message"),
     [
         (
             {"family": "servo", "controls": "velocity"},
@@ -165,12 +166,12 @@ def test_an_agent_asks_a_motor_by_name_for_either(controls):
         ),
     ],
 )
-def test_what_makes_no_servo_is_refused_with_the_way_to_one(given, message):
+def test_raises_with_a_remedy_if_a_servo_cannot_be_made(setting, message):
     with pytest.raises(ValueError, match=message):
-        resolve(given, None, "x")
+        resolve(setting, None, "x")
 
 
-def test_the_command_line_makes_a_servo_of_a_name_and_a_run_keeps_it(files, monkeypatch):
+def test_the_command_line_makes_a_named_servo_and_a_run_stores_it(files, monkeypatch):
     configs = []
     monkeypatch.setattr("codrl_mj.training.train", lambda config, *_, **__: configs.append(config))
     line = "--actuator sheet.toml --actuator.family servo --actuator.loop.position-gain 10"
@@ -182,13 +183,13 @@ def test_the_command_line_makes_a_servo_of_a_name_and_a_run_keeps_it(files, monk
     Path("run/config.json").write_text(
         json.dumps(prepare_run(Path("other"), configs[0], resume=False, accept_changes=False))
     )
-    made = load_config(Path("run")).actuators[0]
+    actuator = load_config(Path("run")).actuators[0]
     changes = {"motor": {"gear_ratio": 50.0}, "loop": {"position_gain": 10.0}}
-    assert made == resolve({"name": "sheet.toml", "family": "servo", **changes}, None, "x")
-    assert label_of(made) == "sheet servo"
+    assert actuator == resolve({"name": "sheet.toml", "family": "servo", **changes}, None, "x")
+    assert display_label(actuator) == "sheet servo"
 
 
-def test_the_way_to_a_servo_is_told_where_it_is_missed(capsys, files):
+def test_messages_explain_how_to_make_a_servo(capsys, files):
     train = "train pendulum --actuator sheet.toml"
     assert "(--actuator.family servo)" in assert_refused(capsys, f"{train} --env.action position")
     assert "--actuator.loop.controls velocity)" in assert_refused(
@@ -199,11 +200,11 @@ def test_the_way_to_a_servo_is_told_where_it_is_missed(capsys, files):
     )
 
 
-def test_a_servo_in_a_file_is_shown_as_its_motor_and_its_loops(capsys, files):
+def test_a_servo_in_a_file_is_shown_with_its_motor_and_loops(capsys, files):
     assert main(["motor", "show", "servo_sheet.yaml"]) == 0
     assert "loop.velocity_gain" in capsys.readouterr().out
     assert find_loop("servo_sheet.yaml") == ServoLoop(**GAINS)
     assert find_loop("sheet.toml") is None
-    assert find_drive("servo_sheet.yaml") == actuator_over(
+    assert find_drive("servo_sheet.yaml") == override_actuator(
         find_drive("sheet.toml"), {"motor": SERVO["motor"]}
     )

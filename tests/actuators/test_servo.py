@@ -1,4 +1,4 @@
-"""A servo's loops on an inertia, against linear models of them and statics; in an environment; in somebody's model."""
+"""Outer loops of a servo against linear models and statics, in environments and custom models."""
 
 import dataclasses
 import math
@@ -34,18 +34,19 @@ def servo(supply=1e4, **loop):
 
 
 def hinge(timestep=0.001):
-    """The spec of a hinge with a motor, under an integrator that uses its derivatives."""
+    """Return the spec of a hinge with a motor, under an integrator that uses derivatives."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.gravity, body = timestep, [0.0] * 3, spec.worldbody.add_body()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    body.add_geom(size=[0.1] * 3, mass=INERTIA / 0.4 / 0.01)  # a ball
+    # The geom is a ball.
+    body.add_geom(size=[0.1] * 3, mass=INERTIA / 0.4 / 0.01)
     body.add_joint(name="shaft", axis=[0.0, 0.0, 1.0])
     spec.add_actuator(name="it", target="shaft", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
     return spec
 
 
 def run(model, targets, load=0.0, start=0.0):
-    """Positions [rad] and speeds [rad/s] under targets, one a step, and a torque [N*m] besides, from a position."""
+    """Return positions [rad] and speeds [rad/s] under a target per step and a load torque [N*m]."""
     data, rows = mujoco.MjData(model), []
     data.qfrc_applied[:], data.qpos[:] = load, start
     for target in targets:
@@ -55,29 +56,29 @@ def run(model, targets, load=0.0, start=0.0):
     return np.array(rows).T
 
 
-def turned(one, targets, timestep=0.001, load=0.0):
-    return run(codrl_mj.add_motors(hinge(timestep), {"shaft": one}).compile(), targets, load)
+def run_servo(actuator, targets, timestep=0.001, load=0.0):
+    return run(codrl_mj.add_motors(hinge(timestep), {"shaft": actuator}).compile(), targets, load)
 
 
 @pytest.mark.parametrize(
     ("timestep", "rate"),
     matrix_params([(0.001, 2000.0)], [(0.0005, 2000.0), (0.001, 2000.0), (0.0005, 500.0)]),
 )
-def test_a_position_loop_is_the_linear_system_that_it_looks_like(timestep, rate):
-    """Torque g*(K*(q* - q) - w), held over a sample, on an inertia; the loop's rate may be that of the steps or not."""
-    one = servo(velocity_gain=1.5, position_gain=15.0, servo_rate=rate)
+def test_a_position_loop_equals_its_linear_model(timestep, rate):
+    """Compare with a torque g*(K*(q* - q) - w), held over a sample, on an inertia."""
+    actuator = servo(velocity_gain=1.5, position_gain=15.0, servo_rate=rate)
     steps = round(0.5 / timestep)
-    positions, speeds = turned(one, [0.3] * steps, timestep)
+    positions, speeds = run_servo(actuator, [0.3] * steps, timestep)
     plant = signal.cont2discrete(
         (np.eye(2, k=1), np.array([[0.0], [1.0 / TOTAL]]), np.eye(2), np.zeros((2, 1))), 1 / rate
     )
-    state, found = np.zeros(2), []
+    state, states = np.zeros(2), []
     for _ in range(round(0.5 * rate)):
         state = plant[0] @ state + plant[1][:, 0] * 1.5 * (15.0 * (0.3 - state[0]) - state[1])
-        found.append(state)
-    at = np.linspace(0.1, 0.5, 9)
-    ours = np.stack([positions, speeds])[:, np.round(at / timestep).astype(int) - 1]
-    theirs = np.array(found).T[:, np.round(at * rate).astype(int) - 1]
+        states.append(state)
+    times = np.linspace(0.1, 0.5, 9)
+    ours = np.stack([positions, speeds])[:, np.round(times / timestep).astype(int) - 1]
+    theirs = np.array(states).T[:, np.round(times * rate).astype(int) - 1]
     np.testing.assert_allclose(ours[0], theirs[0], atol=0.006 * 0.3)
     np.testing.assert_allclose(ours[1], theirs[1], atol=0.006 * 0.3 * 15.0)
     assert positions[-1] == pytest.approx(0.3, abs=1e-3)
@@ -85,13 +86,13 @@ def test_a_position_loop_is_the_linear_system_that_it_looks_like(timestep, rate)
 
 @pytest.mark.parametrize("integral", [0.0, 20.0])
 @pytest.mark.parametrize(("timestep", "rate"), [(0.05, 1000.0), (0.01, 2000.0), (0.004, 250.0)])
-def test_a_servo_is_sampled_at_its_own_rate_within_a_long_step(timestep, rate, integral):
-    """The recursion of a PI velocity loop on an inertia, sample by sample, against one or a few long steps."""
-    one = servo(
+def test_a_servo_samples_at_its_own_rate_within_a_long_step(timestep, rate, integral):
+    """Compare one or a few long steps with the recursion of a PI velocity loop on an inertia."""
+    actuator = servo(
         controls="velocity", velocity_gain=1.5, velocity_integral_gain=integral, servo_rate=rate
     )
-    one = dataclasses.replace(one, controller=SampledLoop(100e3))
-    _, speeds = turned(one, [2.0] * 4, timestep)
+    actuator = dataclasses.replace(actuator, controller=SampledLoop(100e3))
+    _, speeds = run_servo(actuator, [2.0] * 4, timestep)
     speed, torque, expected = 0.0, 0.0, []
     for _ in range(round(4 * timestep * rate)):
         error = 2.0 - speed
@@ -106,12 +107,12 @@ def test_a_servo_is_sampled_at_its_own_rate_within_a_long_step(timestep, rate, i
 
 
 @pytest.mark.parametrize("saved", [False, True])
-def test_what_the_model_s_own_servo_was_is_gone(saved):
-    """That is `<position kp="3" kv="30">`, under an integrator that would use its derivative too; and in its XML."""
+def test_a_servo_of_the_model_is_replaced(saved):
+    """Replace `<position kp="3" kv="30">` under an implicit integrator; check the XML."""
     ways = []
-    for own in (True, False):
+    for has_servo in (True, False):
         spec = hinge(0.002)
-        if own:
+        if has_servo:
             spec.actuator("it").set_to_position(kp=3.0, kv=30.0)
         motors_added = codrl_mj.add_motors(
             spec, {"shaft": servo(velocity_gain=1.5, servo_rate=500.0)}
@@ -128,15 +129,15 @@ def test_what_the_model_s_own_servo_was_is_gone(saved):
 
 
 @pytest.mark.parametrize(("integral", "left"), [(0.0, 0.2 / 1.5), (20.0, 0.0)])
-def test_an_integral_takes_what_a_load_leaves(integral, left):
-    one = servo(controls="velocity", velocity_gain=1.5, velocity_integral_gain=integral)
-    _, speeds = turned(one, [2.0] * 2000, load=-0.2)
+def test_the_integral_removes_the_error_under_a_load(integral, left):
+    actuator = servo(controls="velocity", velocity_gain=1.5, velocity_integral_gain=integral)
+    _, speeds = run_servo(actuator, [2.0] * 2000, load=-0.2)
     assert speeds[-1] == pytest.approx(2.0 - left, abs=1e-3)
 
 
 def test_the_integral_does_not_wind_up():
-    """The shaft cannot follow for a second, and then can."""
-    one = servo(
+    """Command a speed that the shaft cannot reach for two seconds, then a possible one."""
+    actuator = servo(
         supply=4.0,
         controls="velocity",
         velocity_gain=1.5,
@@ -144,34 +145,34 @@ def test_the_integral_does_not_wind_up():
         max_torque=0.3,
     )
     targets = np.where(np.arange(3000) < 2000, 100.0, 3.0)
-    _, speeds = turned(one, targets)
-    reached = -math.expm1(
-        -2.0 * 0.042**2 / (8.4 * TOTAL / RATIO**2)
-    )  # of the no-load speed, in 2 s
+    _, speeds = run_servo(actuator, targets)
+    # The limit is a share of the no-load speed, reached in 2 s.
+    reached = -math.expm1(-2.0 * 0.042**2 / (8.4 * TOTAL / RATIO**2))
     assert speeds[1999] == pytest.approx(reached * 4.0 / (0.042 * RATIO), rel=1e-3)
     assert (np.abs(speeds[2450:] - 3.0) < 0.05).all()
 
 
-def test_speed_and_torque_keep_their_limits():
-    one = servo(velocity_gain=1.5, max_velocity=2.0, max_torque=0.4)
-    _, speeds = turned(one, [3.0] * 1400)
+def test_speed_and_torque_stay_within_their_limits():
+    actuator = servo(velocity_gain=1.5, max_velocity=2.0, max_torque=0.4)
+    _, speeds = run_servo(actuator, [3.0] * 1400)
     assert speeds[50] == pytest.approx(0.4 / TOTAL * 0.051, rel=0.02)
     assert speeds[700] == pytest.approx(2.0, rel=1e-3)
     assert speeds.max() < 2.01
 
 
-def test_feed_forward_takes_the_lag_away():
+def test_feed_forward_removes_the_lag():
     targets = 0.5 * np.arange(1, 2001) * 0.001
     lags = [
-        targets[-1] - turned(servo(velocity_gain=1.5, velocity_feed_forward=share), targets)[0][-1]
+        targets[-1]
+        - run_servo(servo(velocity_gain=1.5, velocity_feed_forward=share), targets)[0][-1]
         for share in (0.0, 1.0)
     ]
     assert lags[0] == pytest.approx(0.5 / 20.0, rel=0.05)
     assert abs(lags[1]) < 0.05 * lags[0]
     ramp = 2.0 * np.arange(1, 2001) * 0.001
     for inertia, left in ((0.0, 2.0 * TOTAL / 1.5), (TOTAL, 0.0)):
-        one = servo(controls="velocity", velocity_gain=1.5, inertia_feed_forward=inertia)
-        _, speeds = turned(one, ramp)
+        actuator = servo(controls="velocity", velocity_gain=1.5, inertia_feed_forward=inertia)
+        _, speeds = run_servo(actuator, ramp)
         assert ramp[-1] - speeds[-1] == pytest.approx(left, abs=0.003)
 
 
@@ -194,13 +195,13 @@ def test_feed_forward_takes_the_lag_away():
         ),
     ],
 )
-def test_what_cannot_work_is_refused(change, message):
+def test_raises_if_a_servo_cannot_work(change, message):
     with pytest.raises(ValueError, match=message):
-        turned(servo(**{"velocity_gain": 1.5, **change}), [])
+        run_servo(servo(**{"velocity_gain": 1.5, **change}), [])
 
 
 def growth(model, steps=1500):
-    """The growth of a disturbance at rest without gravity: its largest speed late, for that early."""
+    """Return the growth of a disturbance at rest without gravity, as a ratio of largest speeds."""
     data, speeds = mujoco.MjData(model), []
     data.qpos[:], data.qvel[:] = 1e-6 * np.arange(1, model.nq + 1), 1e-6
     while len(speeds) < steps and np.abs(data.qvel).max() < 1e-3:
@@ -223,8 +224,8 @@ def growth(model, steps=1500):
         (1000.0, ("position", 20.0, 0.0), "RK4", 3, 0.0),
     ],
 )
-def test_the_bound_of_stability_is_where_it_is(rate, gains, integrator, links, damping):
-    """3 % below the refused gain a small disturbance dies away, 3 % above it it grows; of chains of links too."""
+def test_the_stability_check_finds_the_actual_bound(rate, gains, integrator, links, damping):
+    """Check that a disturbance decays 3 % below the rejected gain and grows 3 % above it."""
     controls, position, integral = gains
     spec, parent = mujoco.MjSpec(), None
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
@@ -238,7 +239,7 @@ def test_the_bound_of_stability_is_where_it_is(rate, gains, integrator, links, d
         ).set_to_motor()
 
     def motors_added(gain, allow_unstable):
-        one = servo(
+        actuator = servo(
             1e9,
             controls=controls,
             position_gain=position,
@@ -246,7 +247,9 @@ def test_the_bound_of_stability_is_where_it_is(rate, gains, integrator, links, d
             velocity_integral_gain=integral,
             servo_rate=rate,
         )
-        return codrl_mj.add_motors(spec, {f"a{link}": one for link in range(links)}, allow_unstable)
+        return codrl_mj.add_motors(
+            spec, {f"a{link}": actuator for link in range(links)}, allow_unstable
+        )
 
     low, high = 0.2, 2000.0
     while high / low > 1.01:
@@ -269,7 +272,7 @@ ASKED = Servo(
 )
 
 
-def test_an_agent_asks_a_servo_for_positions():
+def test_an_agent_commands_positions_of_a_servo():
     env = gymnasium.make(
         "codrl_mj/Pendulum-v0", actuator=ASKED, action="position", max_episode_steps=500
     )
@@ -277,7 +280,7 @@ def test_an_agent_asks_a_servo_for_positions():
     env.reset(seed=0)
     for _ in range(100):
         _, _, _, _, info = env.step(np.array([1.0], np.float32))
-    # in the units of the joint, and held there against gravity by an error: no integral
+    # The position has the units of the joint. Without an integral, gravity causes an error.
     assert info["error"] == pytest.approx(1.0 - env.unwrapped.data.qpos[0], abs=1e-6)
     assert abs(info["error"]) < 0.1
     assert info["desired_force"] == info["actual_force"]
@@ -294,25 +297,25 @@ def test_an_agent_asks_a_servo_for_positions():
         ),
     ],
 )
-def test_what_a_servo_cannot_be_asked_for_is_refused(env_id, options, message):
+def test_raises_if_a_servo_cannot_follow_the_action(env_id, options, message):
     action = {"action": "position", **options} if options else {}
     with pytest.raises(ValueError, match=message):
         gymnasium.make(f"codrl_mj/{env_id}", actuator=ASKED, **action)
 
 
-def test_servos_in_a_vector_are_the_servos_alone():
+def test_servos_in_a_batch_equal_single_ones():
     draws = {"motor.resistance": Uniform(4.0, 12.0), "loop.velocity_gain": Uniform(1.0, 5.0)}
-    one = dataclasses.replace(ASKED, loop=ServoLoop("velocity", velocity_gain=3.0))
-    arguments = {"actuator": one, "action": "velocity", "randomize": draws}
+    actuator = dataclasses.replace(ASKED, loop=ServoLoop("velocity", velocity_gain=3.0))
+    arguments = {"actuator": actuator, "action": "velocity", "randomize": draws}
     both = [
         gymnasium.make_vec("codrl_mj/Pendulum-v0", 3, kind, **arguments)
         for kind in ("vector_entry_point", "sync")
     ]
     np.testing.assert_array_equal(*(envs.reset(seed=3)[0] for envs in both))
     for action in np.random.default_rng(0).uniform(-10, 10, size=(40, 3, 1)).astype(np.float32):
-        ours, alone = (envs.step(action) for envs in both)
-        np.testing.assert_array_equal(ours[0], alone[0])
-        np.testing.assert_array_equal(ours[4]["error"], alone[4]["error"])
+        ours, separate = (envs.step(action) for envs in both)
+        np.testing.assert_array_equal(ours[0], separate[0])
+        np.testing.assert_array_equal(ours[4]["error"], separate[4]["error"])
 
 
 @pytest.mark.parametrize(
@@ -324,25 +327,31 @@ def test_servos_in_a_vector_are_the_servos_alone():
         ({"volts": 2.0}, "voltage"),
     ],
 )
-def test_a_servo_says_which_limit_it_met_and_what_it_drew(limits, met):
-    """At a held speed, over two samples of the outer loop: what is drawn is heat, work and the field of the winding."""
+def test_signals_report_the_limit_reached_and_the_power(limits, met):
+    """Check at a held speed that the power is heat, work and change of field energy."""
     kinds = {name: limits[name] for name in limits if name == "max_torque"}
     current = {name: limits[name] for name in limits if name == "max_current"}
     loop = ServoLoop("velocity", servo_rate=1000.0, velocity_gain=0.05, **kinds)
-    one = Servo(MOTOR, SampledLoop(20e3, **current), Supply(limits.get("volts", 1e4)), loop)
-    parameters, state, speed = parameters_type(Servo)(*one.numbers), one.State(*[0.0] * 13), 20.0
-    motor, before = one.motor, 0.0
+    actuator = Servo(MOTOR, SampledLoop(20e3, **current), Supply(limits.get("volts", 1e4)), loop)
+    parameters, state, speed = (
+        parameters_type(Servo)(*actuator.parameter_values),
+        actuator.State(*[0.0] * 13),
+        20.0,
+    )
+    motor, before = actuator.motor, 0.0
     for target in (80.0, -60.0):
-        state, _, seen = one.advance(
+        state, _, signals = actuator.advance(
             parameters, 0.002, state, Inputs(target, 0.0, speed, 0.0, 0.0, math.inf)
         )
-        found = {
-            name: getattr(seen, f"{name}_saturated")
+        limits_reached = {
+            name: getattr(signals, f"{name}_saturated")
             for name in ("voltage", "current", "temperature")
         }
-        assert found == {name: float(name == met) for name in found}
-        assert seen.saturated == float(met != "")
+        assert limits_reached == {name: float(name == met) for name in limits_reached}
+        assert signals.saturated == float(met != "")
         field = 0.5 * motor.inductance * (state.current**2 - before**2) / 0.002
-        moved = motor.back_emf_constant * speed * seen.current
-        assert seen.electrical_power == pytest.approx(seen.copper_loss + moved + field, rel=1e-12)
+        moved = motor.back_emf_constant * speed * signals.current
+        assert signals.electrical_power == pytest.approx(
+            signals.copper_loss + moved + field, rel=1e-12
+        )
         before = state.current

@@ -1,4 +1,4 @@
-"""Stability of the discrete loop: against hand-derived polynomials, published numbers and the loop itself."""
+"""Stability of the discrete loop, against polynomials, published numbers and the loop itself."""
 
 import dataclasses
 import re
@@ -40,12 +40,12 @@ def with_gains(actuator, **gains):
 
 
 def electrical_matrix(actuator, timestep):
-    """Transition matrix of the unsaturated loop over one electrical step, read off `advance` itself.
+    """Return the transition matrix of the unsaturated loop over one electrical step.
 
-    Only the states that some gain reads are part of the loop: the current always, the integral if
-    ki > 0 and the previous error if kd > 0.
+    It is determined by calls of `advance`. Only the states that some gain reads are part of the
+    loop: the current always, the integral if ki > 0 and the previous error if kd > 0.
     """
-    parameters = parameters_type(DCMotorActuator)(*actuator.numbers)._replace(
+    parameters = parameters_type(DCMotorActuator)(*actuator.parameter_values)._replace(
         max_voltage=np.inf, substeps=1
     )
     states = [0, *[1] * (actuator.controller.ki > 0), *[2] * (actuator.controller.kd > 0)]
@@ -56,10 +56,10 @@ def electrical_matrix(actuator, timestep):
 
 
 def polynomial_of(actuator, dt):
-    """Characteristic polynomial of the PID loop, expanded by hand from its 3 x 3 matrix.
+    """Return the characteristic polynomial of the PID loop, expanded by hand from its matrix.
 
     With a = dt/L: i' = A i + a kI I - (kD/L) e_old, I' = I - dt i, e_old' = -i, A = 1 - a (R + kP +
-    kI dt + kD/dt). Where kI or kD is zero the root of the state that nothing reads (1 and 0) is
+    kI dt + kD/dt). If kI or kD is zero, the root of the state that nothing reads (1 and 0) is
     divided out.
     """
     motor, loop = actuator.motor, actuator.controller
@@ -76,10 +76,10 @@ def polynomial_of(actuator, dt):
 
 
 @given(motors, plain_loops, timesteps)
-def test_the_spectral_radius_is_that_of_the_hand_derived_polynomial(motor, loop, dt):
+def test_the_spectral_radius_is_that_of_the_polynomial(motor, loop, dt):
     actuator = DCMotorActuator(motor, loop)
     polynomial = polynomial_of(actuator, dt)
-    # the radius itself can be ill-conditioned at a double root; that it is a root is not
+    # A double root can be ill-conditioned, but it still satisfies the polynomial.
     values = np.linalg.eigvals(electrical_matrix(actuator, dt))
     assert len(values) == len(polynomial) - 1
     for value in values:
@@ -90,7 +90,7 @@ def test_the_spectral_radius_is_that_of_the_hand_derived_polynomial(motor, loop,
 
 
 @given(actuators, timesteps)
-def test_the_radius_is_that_of_the_matrix_once_for_each_substep(actuator, dt):
+def test_the_radius_is_that_of_the_matrix_to_the_power_of_the_substeps(actuator, dt):
     radius, count = (
         np.abs(np.linalg.eigvals(electrical_matrix(actuator, dt))).max(),
         actuator.controller.substeps,
@@ -98,11 +98,11 @@ def test_the_radius_is_that_of_the_matrix_once_for_each_substep(actuator, dt):
     assert spectral_radius(actuator, dt) == pytest.approx(radius**count, rel=1e-6 * count, abs=1e-6)
 
 
-# -- the paper's gains, at its steps and at longer ones ------------------------------------------------------
+# -- the paper's gains, at its steps and at longer ones --------------------------------------------
 
 PENDULUM = DCMotorActuator(controller=CurrentLoop(kp=1.0, ki=20.0, kd=1e-6))
 CARTPOLE = DCMotorActuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6))
-# name: actuator, step [s], spectral radius, the kd at which the loop turns unstable
+# Name: actuator, step [s], spectral radius, the kd at which the loop becomes unstable.
 PAPER_LOOPS = {
     "pendulum": (PENDULUM, 0.05, 0.500, 0.038),
     "mountain car": (
@@ -134,7 +134,7 @@ PAPER_LOOPS = {
 
 
 @pytest.mark.parametrize("name", PAPER_LOOPS)
-def test_the_papers_loops_have_their_published_radius_and_derivative_gain(name):
+def test_the_papers_loops_have_the_published_radius_and_gain_limit(name):
     actuator, dt, radius, limit = PAPER_LOOPS[name]
     assert round(spectral_radius(actuator, dt), 3) == radius
     check_stable(actuator, dt)
@@ -151,22 +151,21 @@ def test_the_papers_loops_have_their_published_radius_and_derivative_gain(name):
             if spectral_radius(with_gains(actuator, kd=middle), dt) < 1.0
             else (low, middle)
         )
-    assert low == pytest.approx(limit, abs=0.0005 + 1e-8)  # published to three decimals
+    # The value is published to three decimals.
+    assert low == pytest.approx(limit, abs=0.0005 + 1e-8)
 
 
 @pytest.mark.parametrize(
     ("actuator", "dt", "radius"), [(PENDULUM, 0.1, 2.4), (CARTPOLE, 0.05, 1.67)]
 )
-def test_at_a_longer_step_the_papers_gains_are_unstable_and_the_remedy_is_two_substeps(
-    actuator, dt, radius
-):
+def test_two_substeps_stabilize_the_papers_gains_at_a_longer_step(actuator, dt, radius):
     assert spectral_radius(actuator, dt) == pytest.approx(radius, abs=0.02)
     with pytest.raises(ValueError, match=r"unstable.*Set controller\.substeps = 2"):
         check_stable(actuator, dt)
     check_stable(with_gains(actuator, substeps=2), dt)
 
 
-def test_a_radius_of_exactly_one_is_refused():
+def test_raises_if_the_radius_is_exactly_one():
     actuator = DCMotorActuator(Motor(resistance=1.0, inductance=0.125), CurrentLoop(kp=1.0))
     assert spectral_radius(actuator, 0.125) == 1.0  # |1 - 2|
     with pytest.raises(ValueError, match="spectral radius 1, must be < 1"):
@@ -174,21 +173,25 @@ def test_a_radius_of_exactly_one_is_refused():
 
 
 @given(actuators, timesteps)
-def test_an_unstable_loop_is_refused_with_its_radius_and_a_remedy_that_works(actuator, dt):
+def test_raises_with_the_radius_and_a_remedy_that_works(actuator, dt):
     radius, loop = spectral_radius(actuator, dt), actuator.controller
     if radius < 1.0:
         check_stable(actuator, dt)
         return
-    said = re.escape(f"unstable at a step of {dt:g} s: spectral radius {radius:.4g}, must be < 1. ")
-    with pytest.raises(ValueError, match=f"{said}.*allow_unstable=True") as refused:
+    message = re.escape(
+        f"unstable at a step of {dt:g} s: spectral radius {radius:.4g}, must be < 1. "
+    )
+    with pytest.raises(ValueError, match=f"{message}.*allow_unstable=True") as refused:
         check_stable(actuator, dt)
     proposed = re.search(r"Set controller\.substeps = (\d+)", str(refused.value))
     if proposed:
         substeps = int(proposed.group(1))
         assert substeps > loop.substeps
         check_stable(with_gains(actuator, substeps=substeps), dt)
-        check_stable(actuator, dt * loop.substeps / substeps)  # "or shorten the step"
-        if substeps > 2 * loop.substeps:  # and it is no larger than it needs to be
+        # The other remedy is a shorter step.
+        check_stable(actuator, dt * loop.substeps / substeps)
+        # The number of substeps is not larger than necessary.
+        if substeps > 2 * loop.substeps:
             assert spectral_radius(with_gains(actuator, substeps=substeps // 2), dt) >= 1.0
     else:
         remedy = (
@@ -203,37 +206,39 @@ def test_an_unstable_loop_is_refused_with_its_radius_and_a_remedy_that_works(act
             )
 
 
-# -- many at once -------------------------------------------------------------------------------------------
+# -- many actuators at once ------------------------------------------------------------------------
 
 
 @settings(max_examples=40)
 @given(st.lists(actuators, min_size=1, max_size=8), timesteps)
-def test_many_are_each_the_one_to_the_last_bit_and_the_quick_test_is_below_one_where_they_are(
-    several, dt
-):
-    numbers = np.array([one.numbers for one in several])
+def test_many_radii_equal_single_ones_and_agree_with_the_fast_test(many, dt):
+    numbers = np.array([actuator.parameter_values for actuator in many])
     radii = spectral_radii(DCMotorActuator, numbers, dt)
-    np.testing.assert_array_equal(radii, [spectral_radius(one, dt) for one in several])
+    np.testing.assert_array_equal(radii, [spectral_radius(actuator, dt) for actuator in many])
     np.testing.assert_array_equal(stability_radii(DCMotorActuator, numbers, dt) < 1.0, radii < 1.0)
 
 
 @given(motors, st.sampled_from([-1.0, 1.0]), st.integers(-3, 3), timesteps)
-def test_the_quick_test_asks_the_eigenvalues_on_the_edge(motor, pole, nudge, dt):
-    """A proportional loop whose pole is +-1, give or take some rounding errors."""
+def test_the_fast_test_uses_eigenvalues_in_doubtful_cases(motor, pole, nudge, dt):
+    """Check a proportional loop whose pole is +-1 within some rounding errors."""
     kp = (1.0 - pole) * motor.inductance / dt - motor.resistance
     assume(kp >= 0.0)
     numbers = np.array(
-        [DCMotorActuator(motor, CurrentLoop(kp=kp + nudge * np.spacing(max(kp, 1.0)))).numbers]
+        [
+            DCMotorActuator(
+                motor, CurrentLoop(kp=kp + nudge * np.spacing(max(kp, 1.0)))
+            ).parameter_values
+        ]
     )
     np.testing.assert_array_equal(
         stability_radii(DCMotorActuator, numbers, dt), spectral_radii(DCMotorActuator, numbers, dt)
     )
 
 
-def test_the_quick_test_asks_nobody_where_the_case_is_clear(monkeypatch):
+def test_the_fast_test_needs_no_eigenvalues_in_clear_cases(monkeypatch):
     monkeypatch.setattr("codrl_mj.actuators.stability.spectral_radii", None)
     numbers = np.array(
-        [DCMotorActuator(controller=CurrentLoop(kp=kp)).numbers for kp in (1.0, 1e4)]
+        [DCMotorActuator(controller=CurrentLoop(kp=kp)).parameter_values for kp in (1.0, 1e4)]
     )
     np.testing.assert_array_equal(stability_radii(DCMotorActuator, numbers, 0.01), [0.0, np.inf])
 
@@ -242,7 +247,7 @@ def test_the_quick_test_asks_nobody_where_the_case_is_clear(monkeypatch):
 def test_gains_that_overflow_are_unstable_at_any_number_of_substeps(field):
     numbers = np.array(
         [
-            with_gains(DCMotorActuator(), **{field: 1e308}, substeps=count).numbers
+            with_gains(DCMotorActuator(), **{field: 1e308}, substeps=count).parameter_values
             for count in (1, 4)
         ]
     )

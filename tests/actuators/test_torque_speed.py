@@ -1,4 +1,4 @@
-"""The torque-speed line: against what Isaac Lab and mjlab expect of their DC motors."""
+"""Torque-speed line, against the expectations of Isaac Lab and mjlab for their DC motors."""
 
 import math
 
@@ -6,11 +6,11 @@ import mujoco
 import pytest
 
 import codrl_mj
-from codrl_mj.actuators import Inputs, TorqueSpeed, actuator_over, parameters_type
+from codrl_mj.actuators import Inputs, TorqueSpeed, override_actuator, parameters_type
 
 # Isaac Lab, source/isaaclab/test/actuators/test_dc_motor.py, test_dc_motor_clip, at
 # saturation_effort 100, velocity_limit 50, effort_limit 60; mjlab, tests/test_dc_actuator.py, at
-# saturation_effort 20, velocity_limit 30
+# saturation_effort 20, velocity_limit 30.
 ISAAC, MJLAB = TorqueSpeed(100.0, 50.0, 60.0), TorqueSpeed(20.0, 30.0, 20.0)
 CASES = [  # motor, desired, speed, delivered, in the first and fourth quadrant
     (ISAAC, 30.0, 10.0, 30.0),
@@ -32,12 +32,15 @@ CASES = [  # motor, desired, speed, delivered, in the first and fourth quadrant
 ]
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])  # the second and third quadrant mirror the others
+# The second and third quadrant mirror the others.
+@pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("motor", "desired", "speed", "expected"), CASES)
-def test_points_in_four_quadrants_are_those_of_others(motor, desired, speed, expected, sign):
+def test_points_in_four_quadrants_equal_those_of_other_libraries(
+    motor, desired, speed, expected, sign
+):
     inputs = Inputs(sign * desired, 0.0, sign * speed, 0.0, 0.0)
     _, torque, signals = motor.advance(
-        parameters_type(TorqueSpeed)(*motor.numbers), 0.01, (), inputs
+        parameters_type(TorqueSpeed)(*motor.parameter_values), 0.01, (), inputs
     )
     assert torque == pytest.approx(sign * expected, rel=1e-12, abs=1e-12)
     assert signals.lower_limit <= torque <= signals.upper_limit
@@ -50,10 +53,10 @@ LEG = """<mujoco><option timestep="1e-6"/><worldbody><body><joint name="knee" ax
 
 @pytest.mark.parametrize("more", [{}, {"max_torque": 30.0}, {"max_torque": 10.0}])
 @pytest.mark.parametrize("speed", [0.0, 6.0, 15.0, 29.0])
-def test_nothing_but_what_is_given_limits_a_printed_line_in_mujoco(speed, more):
-    """The closed form min(asked, stall*(1 - w/w0), most), where most is the stall torque unless it is given."""
-    given = {"family": "torque_speed", "stall_torque": 24.0, "no_load_speed": 30.0, **more}
-    model = codrl_mj.add_motors(mujoco.MjSpec.from_string(LEG), {"knee": given}).compile()
+def test_a_torque_limit_in_mujoco_is_the_stall_torque_unless_specified(speed, more):
+    """Compare with min(command, stall*(1 - w/w0), limit); the limit defaults to stall."""
+    settings = {"family": "torque_speed", "stall_torque": 24.0, "no_load_speed": 30.0, **more}
+    model = codrl_mj.add_motors(mujoco.MjSpec.from_string(LEG), {"knee": settings}).compile()
     data = mujoco.MjData(model)
     data.ctrl[0], data.qvel[0] = 20.0, speed
     mujoco.mj_step(model, data)
@@ -61,9 +64,9 @@ def test_nothing_but_what_is_given_limits_a_printed_line_in_mujoco(speed, more):
     assert data.actuator_force[0] == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_stall_torque_set_over_the_defaults_is_not_cut_either():
-    motor = actuator_over(TorqueSpeed(), {"stall_torque": 24.0})
-    for asked, expected in ((30.0, 24.0), (-30.0, -24.0)):
-        numbers = parameters_type(TorqueSpeed)(*motor.numbers)
-        assert motor.advance(numbers, 0.01, (), Inputs(asked, 0.0, 0.0, 0.0, 0.0))[1] == expected
+def test_a_stall_torque_above_the_default_is_not_limited():
+    motor = override_actuator(TorqueSpeed(), {"stall_torque": 24.0})
+    for command, expected in ((30.0, 24.0), (-30.0, -24.0)):
+        numbers = parameters_type(TorqueSpeed)(*motor.parameter_values)
+        assert motor.advance(numbers, 0.01, (), Inputs(command, 0.0, 0.0, 0.0, 0.0))[1] == expected
     assert math.isinf(motor.max_torque)

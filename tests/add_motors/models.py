@@ -25,7 +25,7 @@ from codrl_mj.actuators import (
     TorqueSpeed,
 )
 from codrl_mj.fields import real
-from codrl_mj.physics.mjcf import drive, install_callbacks
+from codrl_mj.physics.mjcf import configure_actuator, install_callbacks
 
 INTEGRATORS = ("Euler", "RK4", "implicitfast")
 
@@ -64,8 +64,8 @@ class Worn(ActuatorModel):
     advance: ClassVar = staticmethod(advance)
 
     arm_radius: float = real(0.7, above=0.0, unit="m")
-    stiffness: float = real(0.25, least=0.0, unit="N*m/rad")
-    rotor: float = real(0.0, least=0.0, unit="kg*m^2")
+    stiffness: float = real(0.25, minimum=0.0, unit="N*m/rad")
+    rotor: float = real(0.0, minimum=0.0, unit="kg*m^2")
 
     @property
     def additions(self):
@@ -141,7 +141,7 @@ def behind_callback(spec, actuators):
     spec = spec.copy()
     for name, actuator in actuators.items():
         codrl_mj.engine.load_family(type(actuator))
-        drive(
+        configure_actuator(
             spec.actuator(name), actuator, 1.0 / actuator.arm_radius**2 if actuator.MOTION else 1.0
         )
     model = spec.compile()

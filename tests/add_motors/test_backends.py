@@ -54,7 +54,9 @@ def _both(actuators, integrator, kind="hinge"):
             signals = read(data)
             # The plugin backend stores the force, the callback backend computes it from the torque.
             expected = np.where(
-                [motor.tracks for motor in motors], desired[:count], signals["actual_force"]
+                [motor.is_torque_controlled for motor in motors],
+                desired[:count],
+                signals["actual_force"],
             )
             np.testing.assert_allclose(signals.pop("desired_force"), expected, rtol=1e-15)
             rows.append(

@@ -10,7 +10,7 @@ import mujoco
 import pytest
 
 import codrl_mj
-from codrl_mj.actuators import DCMotorActuator, family_number
+from codrl_mj.actuators import DCMotorActuator, family_id
 from codrl_mj.cli import main
 from codrl_mj.physics import motors
 from codrl_mj.runs.files import sealed
@@ -24,7 +24,7 @@ OLD_NUMBER = 843097
 
 def test_a_model_with_an_old_number_is_refused_by_the_number():
     xml = Path(codrl_mj.user_code.asset_path("cartpole.xml")).read_text()
-    number = str(family_number(DCMotorActuator))
+    number = str(family_id(DCMotorActuator))
     assert number in xml
     model = mujoco.MjModel.from_xml_string(xml.replace(number, str(OLD_NUMBER)))
     with pytest.raises(ValueError, match=rf"family {OLD_NUMBER} .*earlier version.*build it again"):

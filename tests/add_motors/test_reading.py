@@ -8,7 +8,7 @@ import pytest
 
 import codrl_mj
 from codrl_mj.actuators import Lag, TorqueSpeed
-from codrl_mj.physics.mjcf import drive, install_callbacks
+from codrl_mj.physics.mjcf import configure_actuator, install_callbacks
 from tests.add_motors.models import LOOP, arm, behind_callback, behind_plugin
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
@@ -20,7 +20,7 @@ def _mixed():
     """Return a model with a motor in each backend, and an actuator without a motor."""
     spec = arm()
     spec.add_actuator(name="plain", target="lower", trntype=mujoco.mjtTrn.mjTRN_JOINT)
-    drive(spec.actuator("one"), LOOP, 1.0)
+    configure_actuator(spec.actuator("one"), LOOP, 1.0)
     model = codrl_mj.add_motors(spec, {"two": LINE}).compile()
     install_callbacks(model)
     return model

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import codrl_mj
-from codrl_mj.actuators import Lag, reference
+from codrl_mj.actuators import Lag, import_path
 from codrl_mj.plugin import NAME, registered_plugins
 from tests.add_motors.models import (
     GYMNASIUM,
@@ -167,9 +167,9 @@ def test_another_process_has_the_same_motors_and_a_model_cannot_import_code(tmp_
     ("old", "new", "reason"),
     [
         ("250700 ", "2507 ", "user data do not begin with codrl_mj's signature"),
-        (reference(Lag), reference(type(LOOP)), "name different families"),
+        (import_path(Lag), import_path(type(LOOP)), "name different families"),
         (
-            reference(Lag),
+            import_path(Lag),
             "codrl_mj.actuators:Missing",
             "'codrl_mj.actuators:Missing' is not loaded",
         ),

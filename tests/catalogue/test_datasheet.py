@@ -1,4 +1,4 @@
-"""Datasheets: what is printed comes back as the motor that it was printed of, and slips are refused."""
+"""Datasheets: printed values yield the original motor, and mistakes raise errors."""
 
 import dataclasses
 import math
@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from codrl_mj.catalogue import Datasheet, derivation, from_datasheet, motor_entry, units
-from codrl_mj.catalogue.datasheet import KINDS, named
+from codrl_mj.catalogue.datasheet import KINDS, to_field_names
 
-UNITS = {  # by definition: SI value of one unit
+UNITS = {  # SI value of one unit, by definition
     "V": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
     "A": {"A": 1.0, "mA": 1e-3},
     "s": {"s": 1.0, "ms": 1e-3},
@@ -63,19 +63,19 @@ POLOLU = {
 @pytest.mark.parametrize(
     ("kind", "unit"), [(kind, unit) for kind, sizes in units._USUAL.items() for unit in sizes]
 )
-def test_usual_units_have_pint_s_sizes_to_the_bit(kind, unit, monkeypatch):
+def test_common_units_have_exactly_pints_sizes(kind, unit, monkeypatch):
     numbers = [
-        units.in_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)
+        units.to_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)
     ]
     monkeypatch.setattr(units, "_USUAL", {})
     assert numbers == [
-        units.in_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)
+        units.to_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)
     ]
 
 
 @st.composite
 def _motors(draw):
-    """An ideal motor, and what a datasheet would print of it, in SI at the motor's shaft."""
+    """Draw an ideal motor and the SI values of its datasheet at the motor's shaft."""
     voltage, resistance, constant, inertia = draw(SIZES), draw(SIZES), draw(SIZES), draw(SIZES)
     stall = voltage / resistance
     free = stall * draw(st.floats(0.0, 0.3))
@@ -99,7 +99,7 @@ def _motors(draw):
 
 @st.composite
 def _print(draw, printed):
-    """The values as text, each in a unit of its own."""
+    """Return the values as text, each in a randomly chosen unit."""
     text = {}
     for name, value in printed.items():
         unit, size = draw(st.sampled_from(sorted(UNITS[KINDS[name].unit].items())))
@@ -108,7 +108,7 @@ def _print(draw, printed):
 
 
 @given(st.data())
-def test_a_motor_comes_back_from_its_stall_and_free_points(data):
+def test_stall_and_no_load_points_yield_the_motor(data):
     motor, printed = data.draw(_motors())
     numbers = from_datasheet(**data.draw(_print(printed)))
     for name, value in motor.items():
@@ -125,7 +125,7 @@ def test_a_motor_comes_back_from_its_stall_and_free_points(data):
 
 
 @given(st.data(), st.floats(1.0, 500.0), st.floats(0.25, 0.99))
-def test_a_geared_motor_comes_back_from_its_output(data, ratio, efficiency):
+def test_values_at_the_output_yield_the_motor(data, ratio, efficiency):
     motor, printed = data.draw(_motors())
     printed["stall_torque"] *= ratio * efficiency
     printed["no_load_speed"] /= ratio
@@ -133,31 +133,31 @@ def test_a_geared_motor_comes_back_from_its_output(data, ratio, efficiency):
     text = data.draw(_print(printed))
     text["rotor_inertia"] += " at output"
     numbers = from_datasheet(shaft="output", gear_ratio=ratio, **text)
+    # The gear transmits this share of the torque.
     assert numbers.gear_efficiency == pytest.approx(efficiency, rel=1e-11)
-    free = (
-        efficiency * motor["torque_constant"] * printed["no_load_current"]
-    )  # what the gear leaves of the torque
+    free = efficiency * motor["torque_constant"] * printed["no_load_current"]
     assert numbers.coulomb_friction == pytest.approx(free, rel=1e-11)
+    # Without these, the constant follows from the torque if the efficiency is printed.
     for name, value in motor.items():
         assert getattr(numbers, name) == pytest.approx(value, rel=1e-12), name
-    del text[
-        "no_load_speed"
-    ]  # then the constant follows from the torque, if the efficiency is printed
-    told = from_datasheet(
+    del text["no_load_speed"]
+    numbers_without_loss = from_datasheet(
         shaft="output",
         gear_ratio=f"{ratio!r}:1",
         gear_efficiency=f"{efficiency * 100.0!r} %",
         **text,
     )
-    assert told.torque_constant == pytest.approx(motor["torque_constant"], rel=1e-12)
+    assert numbers_without_loss.torque_constant == pytest.approx(
+        motor["torque_constant"], rel=1e-12
+    )
 
 
 @given(st.data())
-def test_a_motor_comes_back_from_its_constants(data):
+def test_constants_yield_the_motor(data):
     motor, printed = data.draw(_motors())
     constant, ohms = motor["torque_constant"], motor["resistance"]
     inertia, henries = motor["rotor_inertia"], printed["electrical_time_constant"] * ohms
-    one = data.draw(
+    printed_constant = data.draw(
         st.sampled_from(
             [
                 {"torque_constant": constant},
@@ -168,22 +168,29 @@ def test_a_motor_comes_back_from_its_constants(data):
     )
     numbers = from_datasheet(
         **data.draw(
-            _print({"resistance": ohms, "inductance": henries, "rotor_inertia": inertia, **one})
+            _print(
+                {
+                    "resistance": ohms,
+                    "inductance": henries,
+                    "rotor_inertia": inertia,
+                    **printed_constant,
+                }
+            )
         )
     )
     expected = (ohms, henries, constant, constant, inertia)
-    found = (
+    constants = (
         numbers.resistance,
         numbers.inductance,
         numbers.torque_constant,
         numbers.back_emf_constant,
     )
-    assert (*found, numbers.rotor_inertia) == pytest.approx(expected, rel=1e-12)
+    assert (*constants, numbers.rotor_inertia) == pytest.approx(expected, rel=1e-12)
     assert numbers.voltage is numbers.coulomb_friction is numbers.continuous_current is None
 
 
 @given(st.data(), st.floats(0.35, 0.9))
-def test_a_motor_comes_back_from_two_points_of_its_line(data, load):
+def test_two_points_of_the_line_yield_the_motor(data, load):
     motor, printed = data.draw(_motors())
     current = load * printed["stall_current"]
     point = {
@@ -200,7 +207,7 @@ def test_a_motor_comes_back_from_two_points_of_its_line(data, load):
 
 
 @given(st.floats(0.01, 0.9))
-def test_printed_friction_takes_its_part_of_the_no_load_current(share):
+def test_printed_friction_is_part_of_the_no_load_current(share):
     free = {
         "resistance": "1 ohm",
         "inductance": "1 mH",
@@ -226,22 +233,22 @@ def test_printed_friction_takes_its_part_of_the_no_load_current(share):
 
 
 @pytest.mark.parametrize("known", ["torque_constant", "back_emf_constant", "speed_constant"])
-def test_constants_at_the_output_are_reflected_by_the_ratio(known):
+def test_constants_at_the_output_are_converted_by_the_ratio(known):
     value = {
         "torque_constant": "3 N*m/A",
         "back_emf_constant": "3 V*s/rad",
         "speed_constant": "1 rad/s/V",
     }[known]
-    seen = 1.0 if known == "speed_constant" else 3.0
+    factor = 1.0 if known == "speed_constant" else 3.0
     numbers = from_datasheet(
         resistance="1 ohm", inductance="1 mH", gear_ratio=30, shaft="output", **{known: value}
     )
     assert (numbers.torque_constant, numbers.back_emf_constant) == pytest.approx(
-        (seen / 30.0, seen / 30.0)
+        (factor / 30.0, factor / 30.0)
     )
 
 
-def test_without_a_no_load_current_none_is_taken_off():
+def test_without_a_no_load_current_none_is_subtracted():
     numbers = from_datasheet(
         **{name: value for name, value in CIM.items() if name != "no_load_current"}
     )
@@ -250,8 +257,8 @@ def test_without_a_no_load_current_none_is_taken_off():
     assert numbers.coulomb_friction is numbers.viscous_friction is None
 
 
-def test_a_gear_gains_nothing():
-    """Rounding may make a gear of 1.05, which is 1 and a disagreement; more than the tolerance is refused."""
+def test_a_gear_efficiency_is_at_most_1():
+    """Check that 1.05 by rounding becomes 1 and a disagreement, and that larger values raise."""
     geared = {**GEARED, "torque_constant": "0.1 N*m/A at motor"}
     numbers = from_datasheet(
         **geared, continuous_current="2 A", continuous_torque="2.1 N*m at output"
@@ -262,7 +269,7 @@ def test_a_gear_gains_nothing():
         from_datasheet(**geared, continuous_current="2 A", continuous_torque="3 N*m at output")
 
 
-def test_the_torque_that_a_gear_bears_for_ever_gives_the_current():
+def test_the_continuous_torque_at_the_output_yields_the_current():
     geared = {**GEARED, "torque_constant": "0.1 N*m/A at motor"}
     numbers = from_datasheet(
         **geared, gear_efficiency=0.5, continuous_torque="2 N*m at output", no_load_current="1 A"
@@ -271,7 +278,7 @@ def test_the_torque_that_a_gear_bears_for_ever_gives_the_current():
     assert numbers.disagreements == ()
 
 
-def test_every_number_says_how_it_came_about():
+def test_every_parameter_has_an_origin():
     numbers = from_datasheet(
         **CIM,
         max_winding_temperature="125 °C",
@@ -293,8 +300,8 @@ def test_every_number_says_how_it_came_about():
         assert (name in numbers.derived) == known
 
 
-def test_thermal_numbers_are_read_with_their_offsets_and_of_either_print():
-    """A temperature has an offset, a difference in K/W or degC/W has none."""
+def test_thermal_values_are_read_with_offsets_and_from_both_forms():
+    """Check that a temperature has an offset, and a difference in K/W or degC/W has none."""
     kelvin = from_datasheet(
         **CIM,
         max_winding_temperature="398.15 K",
@@ -316,13 +323,17 @@ def test_thermal_numbers_are_read_with_their_offsets_and_of_either_print():
         from_datasheet(**CIM, **parts, thermal_resistance="9 K/W")
 
 
-def test_a_disagreement_has_both_values_and_what_to_make_of_it():
-    (found,) = from_datasheet(**CIM).disagreements
-    assert found.quantity == "torque_constant"
-    assert found.printed == pytest.approx(2.42 / (133.0 - 2.7))
-    assert found.computed == pytest.approx((12.0 - 12.0 / 133.0 * 2.7) / (5310.0 * math.tau / 60.0))
-    assert found.difference == pytest.approx(found.computed / found.printed - 1.0)
-    assert "equal in SI" in str(found)
+def test_a_disagreement_has_both_values_and_an_explanation():
+    (disagreement,) = from_datasheet(**CIM).disagreements
+    assert disagreement.quantity == "torque_constant"
+    assert disagreement.printed == pytest.approx(2.42 / (133.0 - 2.7))
+    assert disagreement.computed == pytest.approx(
+        (12.0 - 12.0 / 133.0 * 2.7) / (5310.0 * math.tau / 60.0)
+    )
+    assert disagreement.difference == pytest.approx(
+        disagreement.computed / disagreement.printed - 1.0
+    )
+    assert "equal in SI" in str(disagreement)
 
 
 def test_a_phase_of_a_star_may_be_written_as_a_product():
@@ -359,9 +370,9 @@ def test_a_phase_of_a_star_may_be_written_as_a_product():
         ("no_load_speed", "1e5 rpm", 10471.976),
     ],
 )
-def test_values_are_read_as_makers_write_them(name, printed, value):
-    """By definition: kgf 9.80665 N, oz 28.349523 g, in 25.4 mm, a turn 2 pi."""
-    (reading,) = Datasheet(**named({name: printed})).readings().values()
+def test_values_are_read_in_manufacturers_spellings(name, printed, value):
+    """Compare with definitions: kgf 9.80665 N, oz 28.349523 g, in 25.4 mm, a turn 2 pi."""
+    (reading,) = Datasheet(**to_field_names({name: printed})).readings().values()
     assert reading.value == pytest.approx(value, rel=1e-6)
 
 
@@ -376,18 +387,18 @@ REFUSED = {
         "9000 eRPM",
         "divide by the pole pairs",
     ),
-    "pole pairs": ({"pole_pairs": 14}, "pole_pairs", "leave it out", "electrical rpm"),
+    "pole pairs": ({"pole_pairs": 14}, "pole_pairs", "omit it", "electrical rpm"),
     "a phase": (
         {"phase_resistance": "0.3 ohm"},
         "phase_resistance",
-        "of a delta two thirds",
+        "two thirds for a delta",
         '"2 * 0.3 ohm"',
     ),
     "two names": (
         {"kv": "1 rpm/V", "speed_constant": "1 rpm/V"},
         "speed_constant",
-        "given already",
-        "leave one",
+        "specified already",
+        "omit one",
     ),
     "which shaft": (POLOLU, "shaft is missing", "stall_torque, no_load_speed", 'shaft = "output"'),
     "the other shaft": (
@@ -495,7 +506,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_a_slip_is_refused_with_field_value_and_remedy(case):
+def test_raises_with_field_value_and_remedy(case):
     printed, *words = REFUSED[case]
     with pytest.raises(ValueError) as error:  # noqa: PT011 - the words are the match
         from_datasheet(**printed)
@@ -503,24 +514,24 @@ def test_a_slip_is_refused_with_field_value_and_remedy(case):
         assert word in str(error.value)
 
 
-def test_without_strictness_a_contradiction_is_only_listed():
+def test_contradictions_are_only_listed_if_not_strict():
     numbers = from_datasheet(**CIM | {"stall_torque": "2.42 mN*m"}, strict=False)
     assert numbers.disagreements[0].quantity == "torque_constant"
     assert abs(numbers.disagreements[0].difference) > 100.0
 
 
-def test_the_rules_speak_of_fields():
+def test_the_rules_use_fields_only():
     for quantity, formula in (*derivation.RULES, *(check[:2] for check in derivation.CHECKS)):
-        assert {quantity, *derivation.compiled(formula).co_names} <= {
+        assert {quantity, *derivation.compile_formula(formula).co_names} <= {
             *KINDS,
             *derivation.AT_OUTPUT,
         }, formula
-    first = derivation.compiled(derivation.RULES[0][1])
+    first = derivation.compile_formula(derivation.RULES[0][1])
     assert first.co_names == ("nominal_voltage", "stall_current")
     assert eval(first, {}, {"nominal_voltage": 12.0, "stall_current": 133.0}) == 12.0 / 133.0
 
 
-def test_pint_is_imported_only_when_a_datasheet_is_read():
+def test_pint_is_imported_only_for_a_datasheet():
     script = "import sys, codrl_mj.catalogue.datasheet; assert 'pint' not in sys.modules"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
 
@@ -535,7 +546,7 @@ SERVO = {
     "no_load_current": "180 mA",
     "electrical_time_constant": "0.3 ms",
 }
-"""As servos are printed: Feetech's STS3215."""
+"""Values in the form of servo datasheets: Feetech's STS3215."""
 
 
 @pytest.mark.parametrize(
@@ -551,7 +562,7 @@ SERVO = {
         *("60°/0.222s", "0.222 s/60deg at output", "0.222s/60Deg"),
     ],
 )
-def test_the_time_of_an_angle_is_a_speed(printed):
+def test_the_time_for_an_angle_is_a_speed(printed):
     reading = Datasheet(**SERVO | {"no_load_speed": printed}).readings()["no_load_speed"]
     assert reading.value == pytest.approx(math.pi / 3.0 / 0.222, rel=1e-15)
     assert reading.shaft == "output"
@@ -560,13 +571,13 @@ def test_the_time_of_an_angle_is_a_speed(printed):
 @pytest.mark.parametrize(
     "printed", ["0 s/60deg", "0.2 s/60", "0.2 s", "0.2 s/60deg at 6 V", "0,2 s/60deg"]
 )
-def test_what_is_no_time_of_an_angle_is_refused(printed):
+def test_raises_if_the_time_for_an_angle_is_malformed(printed):
     with pytest.raises(ValueError, match=r"^datasheet\.no_load_speed = "):
         from_datasheet(**SERVO | {"no_load_speed": printed})
 
 
-def test_a_rotors_inertia_behind_a_gear_says_its_shaft():
-    """Printed values are nearly always the rotor's own; reflected they are ratio^2 times as large."""
+def test_the_inertia_behind_a_gear_must_name_its_shaft():
+    """Check that the rotor's inertia, which is usually printed, differs from the reflected one."""
     for unit in ("g*cm2", "g.cm2", "g cm²", "gcm2", "g*cm^2"):
         assert from_datasheet(
             **SERVO, rotor_inertia=f"60 {unit} at motor"
@@ -583,8 +594,8 @@ def test_a_rotors_inertia_behind_a_gear_says_its_shaft():
     ).rotor_inertia == pytest.approx(6e-6)
 
 
-def test_a_torque_constant_at_the_output_has_the_gears_loss_in_it():
-    """With V = R*I0 + kE*w0 and kT = kE, what is printed over N*kT is the efficiency; the rest is as without it."""
+def test_a_torque_constant_at_the_output_includes_the_gears_loss():
+    """Check V = R*I0 + kE*w0 and kT = kE: the printed value over N*kT is the efficiency."""
     speed, resistance = 345.0 * math.pi / 3.0 / 0.222, 12.0 / 2.7
     constant = (12.0 - resistance * 0.18) / speed
     with_it = from_datasheet(**SERVO, torque_constant="11 kg.cm/A")
@@ -592,31 +603,33 @@ def test_a_torque_constant_at_the_output_has_the_gears_loss_in_it():
     assert with_it == dataclasses.replace(
         from_datasheet(**SERVO), disagreements=with_it.disagreements
     )
-    alone = from_datasheet(
+    parameters = from_datasheet(
         **{k: v for k, v in SERVO.items() if k != "stall_torque"}, torque_constant="11 kg.cm/A"
     )
-    assert alone.gear_efficiency == pytest.approx(11.0 * 0.0980665 / (345.0 * constant), rel=1e-12)
-    with pytest.raises(
-        ValueError, match="contradicts the rest"
-    ):  # the motor's own, said to be the output's
+    assert parameters.gear_efficiency == pytest.approx(
+        11.0 * 0.0980665 / (345.0 * constant), rel=1e-12
+    )
+    # These values are the motor's own, but marked as those of the output.
+    with pytest.raises(ValueError, match="contradicts the rest"):
         from_datasheet(**SERVO, torque_constant="6.88 mNm/A")
-    for said in (
+    for values in (
         {"torque_constant": "2.5 Nm/A"},
         {"torque_constant": "11 kg.cm/A", "gear_efficiency": "45 %"},
     ):
-        told = from_datasheet(strict=False, **SERVO, **said)  # of a gear without losses, as ever
-        value = {"2": 2.5, "1": 11.0 * 0.0980665}[said["torque_constant"][0]]
-        assert told.torque_constant == pytest.approx(value / 345.0, rel=1e-12)
+        # Without strictness, a gear has no losses by default.
+        parameters_ = from_datasheet(strict=False, **SERVO, **values)
+        value = {"2": 2.5, "1": 11.0 * 0.0980665}[values["torque_constant"][0]]
+        assert parameters_.torque_constant == pytest.approx(value / 345.0, rel=1e-12)
 
 
-def test_a_file_is_read_whatever_editor_saved_it(tmp_path):
+def test_files_are_read_in_any_encoding(tmp_path):
     file = tmp_path / "servo.toml"
     lines = ["[datasheet]", *(f'{name} = "{value}"' for name, value in SERVO.items())]
     expected = from_datasheet(**SERVO)
     for end in ("\n", "\r\n"):
         for encoding in ("utf-8", "utf-8-sig", "utf-16"):
             file.write_bytes(end.join(lines).encode(encoding))
-            assert motor_entry(str(file)).numbers == expected
+            assert motor_entry(str(file)).parameters == expected
     file.write_bytes("\n".join([*lines, 'rotor_inertia = "60 µg*m^2 at motor"']).encode("cp1252"))
     with pytest.raises(
         ValueError, match=r"line 10 has the byte 0xb5 \(µ in Windows-1252\).*save the file as UTF-8"

@@ -1,4 +1,4 @@
-"""The catalogue: every motor loads, has a source for every value, and agrees with itself or says why not."""
+"""Catalogue: every motor loads, has sources for its values, and is consistent or says why not."""
 
 import dataclasses
 import re
@@ -12,7 +12,7 @@ from codrl_mj.catalogue import motor_entry, motor_names
 from codrl_mj.catalogue.datasheet import KINDS, Datasheet
 
 NAMES = motor_names()
-EXPLAINED = {  # disagreements above 5 % -> what the notes say of them
+EXPLAINED = {  # disagreements above 5 % -> explanation in the notes
     ("cubemars-ak80-6", "speed_constant"): "5 % off the back-EMF",
     ("cubemars-ak80-6", "no_load_speed"): "the speed at 24 V follows the former",
     ("frc-cim", "torque_constant"): "12 % below the back-EMF constant",
@@ -22,7 +22,7 @@ EXPLAINED = {  # disagreements above 5 % -> what the notes say of them
     ("quanser-qube-servo-3", "continuous_speed"): "15 % slower",
     ("rev-neo", "torque_constant"): "27 % above",
 }
-OWN = """
+CUSTOM_FILE = """
 manufacturer = "mine"
 product = "one"
 kind = "brushed"
@@ -37,7 +37,7 @@ inductance = "measured on another"
 """
 
 
-def test_there_are_motors_of_many_kinds():
+def test_the_catalogue_has_motors_of_many_kinds():
     assert len(NAMES) >= 12
     kinds = {motor_entry(name).kind for name in NAMES}
     assert {
@@ -60,10 +60,12 @@ def test_every_value_has_a_source_or_a_reason(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_motor_agrees_with_itself_or_its_notes_say_why_not(name):
+def test_a_motor_is_consistent_or_its_notes_explain_why_not(name):
     entry = motor_entry(name)
     large = {
-        one.quantity for one in entry.numbers.disagreements if abs(one.difference) > 0.05 - 1e-4
+        disagreement.quantity
+        for disagreement in entry.parameters.disagreements
+        if abs(disagreement.difference) > 0.05 - 1e-4
     }
     assert large == {quantity for motor, quantity in EXPLAINED if motor == name}
     for quantity in large:
@@ -71,10 +73,10 @@ def test_a_motor_agrees_with_itself_or_its_notes_say_why_not(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_model_stands_at_the_printed_points(name):
-    """Two equations, winding and shaft, solved for the free motor; and the blocked one."""
+def test_the_model_meets_the_printed_operating_points(name):
+    """Solve two equations, winding and shaft, for the free motor, and for the blocked one."""
     entry = motor_entry(name)
-    numbers, printed = entry.numbers, entry.datasheet.readings()
+    numbers, printed = entry.parameters, entry.datasheet.readings()
     friction = (numbers.coulomb_friction or 0.0), (numbers.viscous_friction or 0.0)
     if {"no_load_speed", "nominal_voltage"} <= printed.keys():
         matrix = [
@@ -102,19 +104,19 @@ def test_the_model_stands_at_the_printed_points(name):
 
 
 @pytest.mark.parametrize("name", ["faulhaber-1331-006", "maxon-ec45-flat-50w", "maxon-re65"])
-def test_what_a_motor_bears_for_ever_is_what_its_thermal_numbers_bear(name):
-    """At 22 to 25 degC around it, with copper's 0.0039/K; some of the heat is friction's and the iron's."""
-    numbers = motor_entry(name).numbers
+def test_the_continuous_current_matches_the_thermal_parameters(name):
+    """Check at 22 to 25 degC with copper's 0.0039/K; friction and iron losses add some heat."""
+    numbers = motor_entry(name).parameters
     rise = numbers.max_temperature - 25.0
     heat = numbers.continuous_current**2 * numbers.resistance * (1.0 + 0.0039 * rise)
     assert 0.7 < numbers.thermal_resistance * heat / rise < 1.0
     assert numbers.thermal_time_constant_winding < numbers.thermal_time_constant_housing
 
 
-def test_the_pmg_132_is_gym_electric_motors():
+def test_the_pmg_132_equals_that_of_gym_electric_motor():
     theirs, ours = (
         DcPermanentlyExcitedMotor._default_motor_parameter,
-        motor_entry("heinzmann-pmg-132").numbers,
+        motor_entry("heinzmann-pmg-132").parameters,
     )
     assert (ours.resistance, ours.inductance) == pytest.approx((theirs["r_a"], theirs["l_a"]))
     assert (ours.torque_constant, ours.rotor_inertia) == pytest.approx(
@@ -122,15 +124,15 @@ def test_the_pmg_132_is_gym_electric_motors():
     )
 
 
-def test_a_file_of_ones_own_is_an_entry(tmp_path):
+def test_a_custom_file_is_an_entry(tmp_path):
     path = tmp_path / "mine.toml"
-    path.write_text(OWN)
+    path.write_text(CUSTOM_FILE)
     entry = motor_entry(str(path))
-    assert (entry.name, entry.numbers.inductance) == ("mine", pytest.approx(1e-3))
+    assert (entry.name, entry.parameters.inductance) == ("mine", pytest.approx(1e-3))
     assert entry.sources == {"resistance": "my bench", "torque_constant": "my bench"}
 
 
-def test_a_file_of_ones_own_need_not_say_who_makes_it_and_its_numbers_are_looked_at_first(tmp_path):
+def test_a_custom_file_needs_no_maker_and_its_values_are_checked_first(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(
         'kind = ""\n[datasheet]\nshaft = ""\nR = ""\nkv = "340 RPM/V"\nresistance = "64'
@@ -141,7 +143,7 @@ def test_a_file_of_ones_own_need_not_say_who_makes_it_and_its_numbers_are_looked
     path.write_text(path.read_text().replace('R = ""', 'rotor_inertia = ""'))
     entry = motor_entry(str(path))
     assert (entry.manufacturer, entry.product, entry.kind, entry.sources) == ("", "mine", "", {})
-    assert entry.numbers.torque_constant == pytest.approx(60.0 / (2.0 * np.pi * 340.0))
+    assert entry.parameters.torque_constant == pytest.approx(60.0 / (2.0 * np.pi * 340.0))
 
 
 @pytest.mark.parametrize(
@@ -158,7 +160,7 @@ def test_a_file_of_ones_own_need_not_say_who_makes_it_and_its_numbers_are_looked
             ),
         ),
         ("resistance =", "resistanse =", "did you mean resistance?"),
-        ('= "the rest"', '= ["resistance"]', "not one for torque_constant"),
+        ('= "the rest"', '= ["resistance"]', "none for torque_constant"),
         ('= "the rest"', "= 5", "must be a list of entries"),
         ('= "the rest"', "= [5]", "must be a list of entries"),
         ('kind = "brushed"', "kind = 5", "kind = 5: must be text"),
@@ -171,23 +173,23 @@ def test_a_file_of_ones_own_need_not_say_who_makes_it_and_its_numbers_are_looked
             "unknown entry estimated.rotor_inertia",
         ),
         ("[estimated]\ninductance =", "estimated =", "unknown datasheet field estimated"),
-        ("[datasheet]", "[datasheet", "is no TOML file"),
+        ("[datasheet]", "[datasheet", "is not a readable TOML file"),
     ],
 )
-def test_a_file_that_lacks_something_is_refused(tmp_path, old, new, words):
+def test_raises_if_a_file_is_incomplete(tmp_path, old, new, words):
     path = tmp_path / "mine.toml"
-    path.write_text(OWN.replace(old, new))
+    path.write_text(CUSTOM_FILE.replace(old, new))
     with pytest.raises(ValueError, match=r"mine\.toml") as error:
         motor_entry(str(path))
     assert words in str(error.value)
 
 
-def test_an_unknown_motor_is_refused_with_the_nearest():
+def test_raises_with_the_nearest_name_of_an_unknown_motor():
     with pytest.raises(ValueError, match="did you mean maxon-re65"):
         motor_entry("maxon-re-65")
 
 
-def test_the_pages_have_every_motor_and_their_examples_run(tmp_path, capsys):
+def test_the_docs_list_every_motor_and_their_examples_run(tmp_path, capsys):
     docs = Path(__file__).parents[2] / "docs"
     catalogue = (docs / "actuators_in_numbers.md").read_text().partition("## The catalogue")[2]
     assert re.findall(r"^\| `([\w-]+)`", catalogue, re.M) == NAMES
@@ -199,12 +201,12 @@ def test_the_pages_have_every_motor_and_their_examples_run(tmp_path, capsys):
     path, written = tmp_path / "my_motor.toml", re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     for upto in range(1, len(written) + 1):
         path.write_text("".join(written[:upto]))
-        assert motor_entry(str(path)).numbers.rotor_inertia == pytest.approx(1.05e-6)
+        assert motor_entry(str(path)).parameters.rotor_inertia == pytest.approx(1.05e-6)
     assert motor_entry(str(path)).sources["stall_torque"] == "a page"
     assert set(motor_entry(str(path)).estimated) == {"inductance"}
 
 
-def test_the_page_names_every_value_of_a_datasheet():
+def test_the_docs_list_every_field_of_a_datasheet():
     page = (Path(__file__).parents[2] / "docs" / "motors.md").read_text()
     named = set(
         re.findall(

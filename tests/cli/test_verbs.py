@@ -348,7 +348,7 @@ def test_training_prints_assumed_motor_values_first(capsys, monkeypatch):
     monkeypatch.setattr("codrl_mj.training.train", lambda *_, **__: None)
     line = "train pendulum --actuator maxon-ec45-flat-339285 --out assumed"
     run_ok(line)
-    assumed = "assumed, for none is given: supply.voltage = 24 V, controller.max_current = inf"
+    assumed = "assumed, because not specified: supply.voltage = 24 V, controller.max_current = inf"
     assert capsys.readouterr().out.splitlines()[0] == assumed
     run_ok(f"{line} --actuator.supply.voltage 12 --actuator.controller.max-current 5")
     assert "assumed, for" not in capsys.readouterr().out

@@ -124,7 +124,10 @@ def test_current_loop_in_c_equals_the_drives_sample_by_sample(tmp_path, name, do
     library, kind = compiled(tmp_path, double, "current_step", "current_reference")
     state = (kind * 2)()
     library.current_reset(state)
-    parameters, period = parameters_type(Drive)(*drive.numbers), 1.0 / drive.controller.sample_rate
+    parameters, period = (
+        parameters_type(Drive)(*drive.parameter_values),
+        1.0 / drive.controller.sample_rate,
+    )
     ours, decay = State(*[0.0] * 9), np.exp(-motor.resistance * period / motor.inductance)
     random = np.random.default_rng(0)
     saturated = 0
@@ -172,7 +175,7 @@ def test_papers_loop_in_c_equals_the_actuators_sample_by_sample(tmp_path, name, 
     actuator = dataclasses.replace(usual, controller=controller, supply=supply)
     write_c(tmp_path, "cartpole", "dqn", double=double, actuator=actuator)
     library, kind = compiled(tmp_path, double, "current_step", "current_reference")
-    parameters = parameters_type(DCMotorActuator)(*actuator.numbers)
+    parameters = parameters_type(DCMotorActuator)(*actuator.parameter_values)
     header = (tmp_path / "controller.h").read_text()
     period = 1.0 / float(
         header.partition("CONTROLLER_CURRENT_RATE ")[2].partition(" ")[0].rstrip("f")
@@ -243,7 +246,7 @@ def test_servo_loops_in_c_equal_the_servos_sample_by_sample(tmp_path, name, doub
     assert library.servo_target(kind(0.5)) == pytest.approx(0.5 * 3.0)
     state, random, limited, free = (kind * 1)(), np.random.default_rng(0), 0, 0
     library.servo_reset(state)
-    parameters, period = parameters_type(Servo)(*servo.numbers), 1.0 / loop.servo_rate
+    parameters, period = parameters_type(Servo)(*servo.parameter_values), 1.0 / loop.servo_rate
     ours, position, speed = Servo.State(*[0.0] * len(Servo.State._fields)), 0.0, 0.0
     for sample in range(1000):
         if sample % 50 == 0:

@@ -1,4 +1,4 @@
-"""Every imperfection that both physics have, for tests that switch them all on."""
+"""Settings of all disturbances that both physics support, for tests that enable all of them."""
 
 MOST = {
     "command_delay": 0.027,
@@ -10,10 +10,10 @@ MOST = {
 }
 """All disturbances."""
 RUBBED = {"damping": 0.03, "friction": 0.02, "armature": 0.01}
-"""What is added to a joint, by MuJoCo only."""
+"""Additions to a joint, supported by MuJoCo only."""
 
 
 def imperfect(actuator):
-    """A mapping of an actuator with a sensor that errs and a supply that sags."""
+    """Return a mapping of an actuator with sensor errors and a supply with a resistance."""
     controller = {**actuator.get("controller", {}), "current_noise": 0.05, "current_bias": -0.02}
     return {**actuator, "controller": controller, "supply": {"resistance": 0.7}}

@@ -1,4 +1,4 @@
-"""The command's way: delay against interpolation, quantiser and rate limiter by their properties."""
+"""Disturbances of the command: delay against interpolation, quantization, rate limit."""
 
 import copy
 import dataclasses
@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from codrl_mj.actuators import GearMotor, SampledLoop, Servo, ServoLoop, Supply
-from codrl_mj.disturbances import Disturbances, quantised, rate_limited, whole_and_fraction
+from codrl_mj.disturbances import Disturbances, limit_rate, quantize, whole_and_fraction
 from codrl_mj.physics.disturber import Disturber
 
 commands = st.lists(st.floats(-10, 10), min_size=1, max_size=30)
@@ -21,21 +21,20 @@ commands = st.lists(st.floats(-10, 10), min_size=1, max_size=30)
 def _arrivals(disturbances, timestep, given_commands, limit=10.0):
     disturber = Disturber(disturbances, timestep, np.array([limit]), 1)
     return np.array(
-        [disturber.disturbed(np.array([[command]]))[0][0, 0] for command in given_commands]
+        [disturber.disturb_commands(np.array([[command]]))[0][0, 0] for command in given_commands]
     )
 
 
 @given(commands, st.floats(0.0, 0.2))
 @settings(max_examples=60, deadline=None)
-def test_a_delayed_command_is_the_interpolation_of_the_commands(values, delay):
+def test_a_delayed_command_is_interpolated(values, delay):
     timestep, count = 0.01, len(values)
     steps = np.arange(-40, count)
+    # A remainder of 1e-9 of a step is rounded to zero.
     padded = np.concatenate([np.zeros(40), values])
     expected = np.interp(np.arange(count) - delay / timestep, steps, padded)
     arrived = _arrivals(Disturbances(command_delay=delay), timestep, values)
-    np.testing.assert_allclose(
-        arrived, expected, rtol=0, atol=1e-7
-    )  # 1e-9 of a step is rounded to none
+    np.testing.assert_allclose(arrived, expected, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("delay", [0.02, 0.06, 0.3])
@@ -48,7 +47,7 @@ def test_whole_steps_shift_without_rounding(delay):
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
 @pytest.mark.parametrize("actuator", ["ideal", "paper"])
-def test_a_delayed_environment_is_one_that_is_told_everything_later(physics, actuator):
+def test_a_delay_equals_later_commands_without_delay(physics, actuator):
     arguments = {"physics": physics, "actuator": actuator}
     delayed = gymnasium.make(
         "codrl_mj/Pendulum-v0", disturbances={"command_delay": 0.1}, **arguments
@@ -76,8 +75,8 @@ SERVO = Servo(
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic", "batch"])
 @pytest.mark.parametrize("more", [{}, {"command_rate": 1e6}])
-def test_a_late_position_is_held_where_the_episode_starts(physics, more):
-    """As in an environment without delay that is asked to stay there first; again after a second reset elsewhere."""
+def test_the_initial_position_is_held_until_the_first_command(physics, more):
+    """Compare with holding the position without a delay; again after a second reset."""
     arguments = {"actuator": SERVO, "action": "position", "timestep": 0.01}
     if physics == "batch":
         make = functools.partial(
@@ -101,7 +100,7 @@ def test_a_late_position_is_held_where_the_episode_starts(physics, more):
             np.testing.assert_allclose(ours[4]["current"], theirs[4]["current"], rtol=0, atol=2e-4)
 
 
-def test_a_late_velocity_is_zero_before():
+def test_the_velocity_is_zero_until_the_first_command():
     servo = dataclasses.replace(
         SERVO, loop=ServoLoop("velocity", servo_rate=100.0, velocity_gain=3.0)
     )
@@ -116,25 +115,25 @@ def test_a_late_velocity_is_zero_before():
     assert (env.unwrapped.physics.memory == 0.0).all()
 
 
-def test_a_snapshot_keeps_the_positions_on_their_way():
+def test_a_snapshot_contains_delayed_positions():
     arguments = {
         "actuator": SERVO,
         "action": "position",
         "timestep": 0.01,
         "disturbances": {"command_delay": 0.1},
     }
-    env, other = (gymnasium.make("codrl_mj/Pendulum-v0", **arguments).unwrapped for _ in range(2))
+    env, second = (gymnasium.make("codrl_mj/Pendulum-v0", **arguments).unwrapped for _ in range(2))
     env.reset(seed=4)
-    other.reset(seed=5)
-    other.restore(env.snapshot())
+    second.reset(seed=5)
+    second.restore(env.snapshot())
     copied = copy.deepcopy(env)
     for _ in range(3):
-        states = [one.step(np.array([0.3], np.float32))[0] for one in (env, other, copied)]
+        states = [env_.step(np.array([0.3], np.float32))[0] for env_ in (env, second, copied)]
         np.testing.assert_array_equal(states[0], states[1])
         np.testing.assert_array_equal(states[0], states[2])
 
 
-def test_the_delay_counts_integration_steps_within_an_environment_step():
+def test_the_delay_counts_integration_steps():
     env = gymnasium.make(
         "codrl_mj/MountainCar-v0",
         actuator="ideal",
@@ -153,8 +152,8 @@ def test_the_delay_counts_integration_steps_within_an_environment_step():
 
 
 @given(st.floats(-1e3, 1e3), st.floats(1e-3, 10), st.floats(0.1, 2e3))
-def test_a_quantised_command_is_the_nearest_multiple_within_the_limit(command, quantum, limit):
-    value = quantised(command, quantum, limit)
+def test_a_quantized_command_is_the_nearest_multiple_within_the_limit(command, quantum, limit):
+    value = quantize(command, quantum, limit)
     clipped = np.clip(command, -limit, limit)
     assert abs(value) <= limit
     if abs(value) < limit:
@@ -162,20 +161,20 @@ def test_a_quantised_command_is_the_nearest_multiple_within_the_limit(command, q
         assert abs(value - command) <= quantum / 2 * (1 + 1e-9) + 1e-12 * abs(command)
     else:
         assert abs(clipped - value) <= quantum
-    assert quantised(np.array([-command]), quantum, limit)[0] == -value
+    assert quantize(np.array([-command]), quantum, limit)[0] == -value
 
 
-def test_half_way_goes_to_the_even_multiple():
+def test_ties_are_rounded_to_the_even_multiple():
     np.testing.assert_array_equal(
-        quantised(np.array([0.25, 0.75, -0.25, 1.25]), 0.5, 9.0), [0.0, 1.0, 0.0, 1.0]
+        quantize(np.array([0.25, 0.75, -0.25, 1.25]), 0.5, 9.0), [0.0, 1.0, 0.0, 1.0]
     )
 
 
 @given(commands, st.floats(1e-3, 5))
-def test_a_rate_limited_command_moves_towards_its_target_and_never_faster(values, change):
+def test_a_rate_limited_command_approaches_its_target_within_the_rate(values, change):
     last = 0.0
     for target in values:
-        value = rate_limited(np.array([target]), np.array([last]), change)[0]
+        value = limit_rate(np.array([target]), np.array([last]), change)[0]
         assert abs(value - last) <= change * (1 + 1e-12) + 1e-12
         if abs(target - last) <= change:
             assert value == pytest.approx(target, abs=1e-12)
@@ -184,23 +183,23 @@ def test_a_rate_limited_command_moves_towards_its_target_and_never_faster(values
         last = value
 
 
-def test_delay_comes_before_the_quantiser_and_the_quantiser_before_the_rate_limit():
+def test_the_order_is_delay_quantization_rate_limit():
     arrived = _arrivals(
         Disturbances(command_delay=0.01, command_quantum=1.0, command_rate=30.0),
         0.02,
         [1.4, 1.4, 4.0],
     )
-    # interpolated: 0.7, 1.4, 2.7; quantised: 1, 1, 3; at most 0.6 a step
+    # Interpolated: 0.7, 1.4, 2.7; quantized: 1, 1, 3; limited to 0.6 per step.
     np.testing.assert_allclose(arrived, [0.6, 1.0, 1.6], rtol=1e-12)
 
 
-def test_several_actuators_of_a_simulation_have_each_its_own_limit():
+def test_each_actuator_of_a_simulation_has_its_own_limit():
     disturbances = Disturbances(command_delay=0.013, command_quantum=0.3, command_rate=100.0)
     limits = np.array([10.0, 2.0, 0.5])
     values = np.random.default_rng(0).uniform(-10, 10, (30, 5, 3))
-    several = Disturber(disturbances, 0.01, limits, 5)
-    together = np.array([several.disturbed(rows)[0] for rows in values])
+    disturber = Disturber(disturbances, 0.01, limits, 5)
+    together = np.array([disturber.disturb_commands(rows)[0] for rows in values])
     for simulation in range(5):
         for actuator, limit in enumerate(limits):
-            alone = _arrivals(disturbances, 0.01, values[:, simulation, actuator], limit)
-            np.testing.assert_array_equal(together[:, simulation, actuator], alone)
+            separate = _arrivals(disturbances, 0.01, values[:, simulation, actuator], limit)
+            np.testing.assert_array_equal(together[:, simulation, actuator], separate)

@@ -1,4 +1,4 @@
-"""Disturbances in an environment: each changes what happens, none leaves everything as it is without them."""
+"""Disturbances in environments: each changes the result, and defaults change nothing."""
 
 import gymnasium
 import numpy as np
@@ -23,7 +23,7 @@ two_tasks = pytest.mark.parametrize("task", matrix_params(["pendulum", "cartpole
 
 
 def _env(task, **arguments):
-    """An environment in its first episode."""
+    """Return an environment in its first episode."""
     env = gymnasium.make(
         TASKS[task].env_id, disable_env_checker=True, **{"actuator": WEAK} | arguments
     ).unwrapped
@@ -31,9 +31,9 @@ def _env(task, **arguments):
     return env
 
 
-@pytest.mark.parametrize("what", EACH)
-def test_each_alone_changes_what_happens(what):
-    disturbed, undisturbed = _env("pendulum", **EACH[what]), _env("pendulum")
+@pytest.mark.parametrize("disturbance", EACH)
+def test_each_disturbance_alone_changes_the_result(disturbance):
+    disturbed, undisturbed = _env("pendulum", **EACH[disturbance]), _env("pendulum")
     for value in np.linspace(-1.7, 1.9, 12, dtype=np.float32):
         disturbed.step(np.array([value]))
         undisturbed.step(np.array([value]))
@@ -42,20 +42,20 @@ def test_each_alone_changes_what_happens(what):
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
 @two_tasks
-def test_off_is_bit_for_bit_as_without(task, physics):
+def test_disabled_disturbances_change_nothing(task, physics):
     off = {
         **WEAK,
         "controller": {**WEAK["controller"], "current_noise": 0.0, "current_bias": 0.0},
         "supply": {},
     }
     env = _env(task, disturbances={}, joint={}, actuator=off, physics=physics)
-    # the episodes after the first, too: nothing was drawn for a key in between
+    # Later episodes are equal, too: no random key was drawn between episodes.
     assert_same(run(env, 60, seed=0), run(_env(task, physics=physics), 60, seed=0))
     if physics == "mujoco":
-        assert env.physics._disturber.on is False
+        assert env.physics._disturber.enabled is False
 
 
 @two_tasks
-def test_the_same_initial_states_are_drawn_with_disturbances_and_without(task):
+def test_initial_states_are_the_same_with_and_without_disturbances(task):
     disturbed = _env(task, disturbances=MOST, joint=RUBBED, actuator=imperfect(WEAK))
     assert_same(plain(disturbed.state), plain(_env(task).state))

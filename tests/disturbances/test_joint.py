@@ -27,7 +27,7 @@ def _pendulum(inner_steps, torque, **joint):
 
 
 def _solved(torque, damping=0.0, friction=0.0):
-    """Gymnasium's pendulum: th'' = 3 g/(2 l) sin(th) + 3/(m l^2) u with g = 10, l = m = 1."""
+    """Integrate th'' = 3 g/(2 l) sin(th) + 3/(m l^2) u, Gymnasium's, with g = 10, l = m = 1."""
 
     def rate(_, state):
         load = torque - damping * state[1] - friction * np.sign(state[1])
@@ -38,24 +38,25 @@ def _solved(torque, damping=0.0, friction=0.0):
     return solution.y[:, -1]
 
 
-def test_damping_is_a_torque_against_the_speed():
+def test_damping_is_a_torque_opposite_to_the_speed():
     expected = _solved(0.5, damping=0.4)
-    coarse, fine = (
+    coarse_error, fine_error = (
         np.abs(_pendulum(steps, 0.5, damping=0.4) - expected).max() for steps in (250, 500)
     )
-    assert fine < 1e-3
-    assert coarse / fine == pytest.approx(2.0, rel=0.1)  # of first order, as the integrator is
+    assert fine_error < 1e-3
+    # The error is of first order, as is the integrator.
+    assert coarse_error / fine_error == pytest.approx(2.0, rel=0.1)
     assert np.abs(_solved(0.5) - expected).max() > 0.1
 
 
-def test_friction_is_a_constant_torque_against_the_motion():
+def test_friction_is_a_constant_torque_opposite_to_the_motion():
     expected = _solved(0.5, friction=0.3)
     assert np.abs(_pendulum(1000, 0.5, friction=0.3) - expected).max() < 2e-3
     assert np.abs(_solved(0.5) - expected).max() > 0.1
 
 
 @pytest.mark.parametrize(("torque", "sticks"), [(0.9, True), (-0.9, True), (1.4, False)])
-def test_friction_holds_what_does_not_exceed_it(torque, sticks):
+def test_friction_holds_smaller_torques(torque, sticks):
     physics = MujocoPhysics(
         SimulationConfig(TASKS["pendulum"], [IDEAL], 10, "semi-implicit", joint=Joint(friction=1.0))
     )
@@ -66,7 +67,7 @@ def test_friction_holds_what_does_not_exceed_it(torque, sticks):
     assert moved != sticks
 
 
-def test_the_solver_is_off_without_friction_and_starts_from_nothing_with_it():
+def test_the_solver_is_off_without_friction_and_has_no_warm_start_with_it():
     flags = {
         name: gymnasium.make("codrl_mj/Pendulum-v0", joint=joint).unwrapped.model.opt.disableflags
         for name, joint in {
@@ -83,7 +84,7 @@ def test_the_solver_is_off_without_friction_and_starts_from_nothing_with_it():
 
 
 def test_the_explicit_integrator_stays_explicit():
-    """CartPole: positions move by the old velocity, and damping is that of the old velocity: a force like any other."""
+    """Check CartPole: positions move by the old velocity, which also determines the damping."""
     damping, cartpole = 2.0, TASKS["cartpole"]
     damped = MujocoPhysics(
         SimulationConfig(
@@ -108,7 +109,7 @@ def test_the_explicit_integrator_stays_explicit():
 
 
 def test_armature_is_an_inertia_of_the_joint():
-    """From rest the pendulum turns by tau/(m l^2/3 + I) for a step of semi-implicit Euler, whatever gravity adds."""
+    """Check that the pendulum starts with tau/(m l^2/3 + I), whatever gravity adds."""
     rotor, torque = 0.25, 1.5
     physics = MujocoPhysics(
         SimulationConfig(

@@ -1,4 +1,4 @@
-"""Sensor noise and bias, and the sagging supply."""
+"""Noise and bias of the current sensor, and the supply's resistance."""
 
 import copy
 
@@ -13,7 +13,7 @@ from tests.engine.models import VOLTAGE
 
 
 def _still(**controller):
-    """A motor without back-EMF under a proportional loop, with whatever else its controller has."""
+    """Return a motor without back-EMF under a proportional loop with additional settings."""
     return {
         "motor": {"back_emf_constant": 0.0},
         "controller": {"kp": 1.0, "max_voltage": float("inf"), **controller},
@@ -22,7 +22,7 @@ def _still(**controller):
 
 @pytest.mark.parametrize(
     ("counter", "key", "expected"),
-    [  # the authors' known answers (Random123, kat_vectors, philox4x32 10)
+    [  # the authors' reference values (Random123, kat_vectors, philox4x32 10)
         ([0] * 4, 0, [0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8]),
         ([0xFFFFFFFF] * 4, 2**64 - 1, [0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD]),
         (
@@ -32,7 +32,7 @@ def _still(**controller):
         ),
     ],
 )
-def test_philox_gives_the_known_answers(counter, key, expected):
+def test_philox_equals_the_reference_values(counter, key, expected):
     assert list(philox(*counter, key)) == expected
 
 
@@ -45,12 +45,12 @@ def test_the_noise_is_standard_normal_and_white():
         np.array([standard_normal(12346.0, step, 0) for step in range(2000)]),
         np.array([standard_normal(12345.0, step, 1) for step in range(2000)]),
     ]
-    for other in others:
-        assert abs(np.corrcoef(numbers[:2000], other)[0, 1]) < 4 / np.sqrt(2000)
+    for other_noise in others:
+        assert abs(np.corrcoef(numbers[:2000], other_noise)[0, 1]) < 4 / np.sqrt(2000)
     assert SENSOR_STREAM != LOAD_STREAM
 
 
-def test_the_controller_of_every_environment_has_its_own_white_noise():
+def test_every_environment_has_its_own_white_noise():
     envs, steps, deviation = 100, 100, 0.25
     actuator = _still(current_noise=deviation, current_bias=0.125)
     env = gymnasium.make_vec("codrl_mj/Pendulum-v0", envs, "vector_entry_point", actuator=actuator)
@@ -58,7 +58,8 @@ def test_the_controller_of_every_environment_has_its_own_white_noise():
     current, noise = np.zeros(envs), []
     for _ in range(steps):
         infos = env.step(np.full((envs, 1), 1.5, np.float32))[4]
-        noise.append(1.5 - current - infos["voltage"])  # u = kp*(i_ref - (i + error)) with kp = 1
+        # The voltage is u = kp*(i_ref - (i + error)) with kp = 1.
+        noise.append(1.5 - current - infos["voltage"])
         current = infos["current"]
     noise = np.array(noise)
     assert noise.mean() == pytest.approx(0.125, abs=4 * deviation / np.sqrt(noise.size))
@@ -69,7 +70,7 @@ def test_the_controller_of_every_environment_has_its_own_white_noise():
 
 
 @pytest.mark.parametrize("task", ["Pendulum", "Acrobot"])
-def test_the_noise_of_a_tick_is_the_same_for_whoever_computes_it(task):
+def test_the_noise_of_a_step_is_always_the_same(task):
     env = gymnasium.make(
         f"codrl_mj/{task}-v0", actuator={"controller": {"current_noise": 0.5}}
     ).unwrapped
@@ -79,10 +80,10 @@ def test_the_noise_of_a_tick_is_the_same_for_whoever_computes_it(task):
     model, data = env.model, env.data
     mujoco.mj_forward(model, data)
     act = data.act.copy()
-    twin = copy.copy(data)
-    for other in (data, twin):
-        mujoco.mj_forward(model, other)
-        np.testing.assert_array_equal(other.act, act)
+    data_copy = copy.copy(data)
+    for data_ in (data, data_copy):
+        mujoco.mj_forward(model, data_)
+        np.testing.assert_array_equal(data_.act, act)
     full = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
     saved = np.empty(mujoco.mj_stateSize(model, full))
     mujoco.mj_getState(model, data, saved, full)
@@ -96,16 +97,18 @@ def test_the_noise_of_a_tick_is_the_same_for_whoever_computes_it(task):
     assert data.act[VOLTAGE] != act[VOLTAGE]
 
 
-def test_episodes_and_seeds_have_their_own_noise_and_seeds_repeat():
+def test_noise_differs_by_episode_and_seed_and_repeats_with_the_seed():
     def voltages(*seeds):
         env = gymnasium.make(
             "codrl_mj/Pendulum-v0", actuator={"controller": {"current_noise": 0.5}}
         )
-        found = []
+        voltages_of_episodes = []
         for seed in seeds:
             env.reset(seed=seed)
-            found.append([env.step(np.zeros(1, np.float32))[4]["voltage"] for _ in range(3)])
-        return found
+            voltages_of_episodes.append(
+                [env.step(np.zeros(1, np.float32))[4]["voltage"] for _ in range(3)]
+            )
+        return voltages_of_episodes
 
     first, second, third = voltages(0, None, 1)
     assert voltages(0, None)[0] == first
@@ -113,44 +116,43 @@ def test_episodes_and_seeds_have_their_own_noise_and_seeds_repeat():
 
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
-def test_a_bias_shifts_the_steady_current_by_the_closed_form(physics):
+def test_a_bias_shifts_the_steady_current_as_computed(physics):
     kp, bias = 1.0, 0.3
     arguments = {"physics": physics, "observe_actuator": True}
     env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=_still(current_bias=bias), **arguments)
     start = env.reset(seed=0)[0]
+    # In the steady state kp*(i_ref - i - b) = R*i.
     for _ in range(60):
         observation, *_, info = env.step(np.array([1.5], np.float32))
-    assert info["current"] == pytest.approx(
-        kp * (1.5 - bias) / (1.0 + kp), rel=1e-9
-    )  # kp*(i_ref - i - b) = R*i
+    assert info["current"] == pytest.approx(kp * (1.5 - bias) / (1.0 + kp), rel=1e-9)
     assert start[-2] == np.float32(bias)
     assert observation[-2] == pytest.approx(info["current"] + bias, rel=1e-6)
 
     integral = _still(ki=5.0, max_voltage=24.0, current_bias=bias)
     env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=integral, **arguments)
     env.reset(seed=0)
+    # The integral corrects the *measured* current.
     for _ in range(150):
         info = env.step(np.array([1.5], np.float32))[4]
-    assert info["current"] == pytest.approx(
-        1.5 - bias, rel=1e-9
-    )  # the integral makes the *measured* current right
+    assert info["current"] == pytest.approx(1.5 - bias, rel=1e-9)
 
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
-def test_a_noisy_observation_is_what_the_controller_measures_next(physics):
+def test_a_noisy_observation_is_the_controllers_next_measurement(physics):
     actuator = _still(current_noise=0.2, current_bias=0.1)
     arguments = {"physics": physics, "actuator": actuator, "observe_actuator": True}
     env = gymnasium.make("codrl_mj/Pendulum-v0", **arguments)
     measured = env.reset(seed=0)[0][-2]
     for _ in range(20):
         observation, *_, info = env.step(np.array([1.5], np.float32))
-        assert info["voltage"] == pytest.approx(1.5 - measured, abs=1e-6)  # kp = 1
+        # The gain kp is 1.
+        assert info["voltage"] == pytest.approx(1.5 - measured, abs=1e-6)
         measured = observation[-2]
 
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
 @pytest.mark.parametrize(("supply", "substeps"), [(0.0, 1), (0.5, 1), (8.0, 4)])
-def test_a_sagging_supply_stalls_the_motor_at_the_closed_form(physics, supply, substeps):
+def test_a_supply_with_a_resistance_stalls_the_motor_as_computed(physics, supply, substeps):
     motor = {"resistance": 1.5, "torque_constant": 0.1, "back_emf_constant": 0.0}
     actuator = {"motor": motor, "controller": {"kp": 1.0, "max_voltage": 5.0, "substeps": substeps}}
     actuator["supply"] = {"resistance": supply}
@@ -163,7 +165,7 @@ def test_a_sagging_supply_stalls_the_motor_at_the_closed_form(physics, supply, s
     assert info["saturated"]
 
 
-def test_a_supply_that_is_spent_gives_no_voltage_and_no_other_sign():
+def test_the_voltage_of_an_overloaded_supply_is_zero_and_never_reversed():
     env = gymnasium.make(
         "codrl_mj/Pendulum-v0",
         actuator={"controller": {"max_voltage": 1.0}, "supply": {"resistance": 100.0}},

@@ -7,7 +7,7 @@ import numpy as np
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.engine.families import SLOT_HEADER_SIZE, SlotHeader, signals_offset
-from codrl_mj.physics.mjcf import drive
+from codrl_mj.physics.mjcf import configure_actuator
 from codrl_mj.user_code import asset_path
 
 FULL = DCMotorActuator(
@@ -63,7 +63,7 @@ _ROTOR = """
 def add_motor(spec, joint, actuator, max_force=None, **fields):
     """Add our motor to a joint of the spec."""
     driver = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint, **fields)
-    drive(driver, actuator, max_force)
+    configure_actuator(driver, actuator, max_force)
     return driver
 
 
@@ -84,7 +84,7 @@ def cartpole(actuator, *, integrator="Euler"):
     """Return the model of the cart-pole asset with another actuator or integrator."""
     spec = mujoco.MjSpec.from_file(str(asset_path("cartpole.xml")))
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
-    drive(spec.actuator("motor"), actuator, 10.0)
+    configure_actuator(spec.actuator("motor"), actuator, 10.0)
     return spec.compile()
 
 

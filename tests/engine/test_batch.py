@@ -73,7 +73,9 @@ def test_each_simulation_of_a_batch_may_have_its_own_motor(name, nthread):
     engine.load_family(Spring)
     motors, models = FAMILIES[name], [rotor(motor) for motor in FAMILIES[name]]
     batch = Batch(models[0], nsim=SIMULATIONS, nthread=nthread)
-    batch.expand("actuator_user")[:, 0, USER_HEADER_SIZE:] = [motor.numbers for motor in motors]
+    batch.expand("actuator_user")[:, 0, USER_HEADER_SIZE:] = [
+        motor.parameter_values for motor in motors
+    ]
     batch.expand("actuator_gear")[:, 0, 0] = [1.0 / motor.arm_radius for motor in motors]
     np.testing.assert_array_equal(batched(batch, models[0]), serial(models))
 

@@ -20,7 +20,7 @@ from codrl_mj.actuators import (
     ServoLoop,
     Supply,
     TorqueSpeed,
-    family_number,
+    family_id,
     parameters_type,
 )
 from codrl_mj.actuators.noise import standard_normal
@@ -40,7 +40,7 @@ from codrl_mj.physics import (
     install_callbacks,
     motors,
 )
-from codrl_mj.physics.mjcf import drive
+from codrl_mj.physics.mjcf import configure_actuator
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed, controls, rotor, rotor_spec, trajectory
 from tests.tasks.faces import every_rebuilt
@@ -67,15 +67,15 @@ class Seen(NamedTuple):
 class Coil:
     """Part of a spring."""
 
-    stiffness: float = real(0.7, least=0.0)
-    turns: int = integer(3, least=1)
+    stiffness: float = real(0.7, minimum=0.0)
+    turns: int = integer(3, minimum=1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Brake:
     """Optional part of a spring."""
 
-    drag: float = real(0.0, least=0.0)
+    drag: float = real(0.0, minimum=0.0)
 
 
 def _softened(torque, limit):
@@ -209,7 +209,7 @@ pytestmark = pytest.mark.usefixtures("_families")
 @pytest.mark.parametrize("actuator", ALL, ids=lambda actuator: type(actuator).__name__)
 def test_a_family_runs_in_the_callback_bit_for_bit_as_in_python(actuator, integrator):
     model, family = rotor(actuator, integrator=integrator), type(actuator)
-    data, parameters = mujoco.MjData(model), parameters_type(family)(*actuator.numbers)
+    data, parameters = mujoco.MjData(model), parameters_type(family)(*actuator.parameter_values)
     states, shown = len(family.State._fields), signals_offset(family)
     data.act[SlotHeader._fields.index("noise_key")] = KEY
     state, timestep, gear = (
@@ -260,7 +260,7 @@ def test_a_motor_is_read_back_from_the_model_unchanged(actuator):
     ((index, motor),) = motors(rotor(actuator)).items()
     assert index == 0
     assert type(motor) is type(actuator)
-    assert motor.numbers == actuator.numbers
+    assert motor.parameter_values == actuator.parameter_values
     assert motor.arm_radius == pytest.approx(actuator.arm_radius, rel=1e-15)
 
 
@@ -275,7 +275,7 @@ def hinges(*actuators):
         + "</worldbody></mujoco>"
     )
     for index, actuator in enumerate(actuators):
-        drive(
+        configure_actuator(
             spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=str(index)), actuator, None
         )
     return spec.compile()
@@ -322,7 +322,7 @@ def test_a_model_compiles_its_families_on_installation():
             return state, 2.0 * inputs.desired_torque, state
 
     spec = rotor_spec()
-    drive(spec.actuator("motor"), Late(), None)
+    configure_actuator(spec.actuator("motor"), Late(), None)
     model = spec.compile()
     with pytest.raises(
         ValueError, match=r"motor: .* is not known in this process: import its module"
@@ -345,11 +345,11 @@ def test_load_family_raises_if_two_families_have_the_same_number(monkeypatch):
 
     monkeypatch.setattr(
         "codrl_mj.engine.families.family_number",
-        lambda family: family_number(Spring),  # noqa: ARG005
+        lambda family: family_id(Spring),  # noqa: ARG005
     )
     with pytest.raises(
         ValueError,
-        match=f"Other and .*:Spring have the same number {family_number(Spring)}: rename one",
+        match=f"Other and .*:Spring have the same number {family_id(Spring)}: rename one",
     ):
         engine.load_family(Other)
     before = loaded_families()
@@ -361,9 +361,9 @@ def test_load_family_raises_if_two_families_have_the_same_number(monkeypatch):
 
 
 def test_a_familys_number_is_unique_and_survives_an_xml_file(tmp_path):
-    numbers = [family_number(type(actuator)) for actuator in ALL]
+    numbers = [family_id(type(actuator)) for actuator in ALL]
     assert len(set(numbers)) == len({type(actuator) for actuator in ALL})
-    assert user_header(Spring)[2] == family_number(Spring)
+    assert user_header(Spring)[2] == family_id(Spring)
     spec = rotor_spec(Spring())
     spec.compile()
     path = tmp_path / "model.xml"

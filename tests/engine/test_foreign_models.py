@@ -14,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("bare_engine")
 USER_HEADER, SIZE = user_header(DCMotorActuator), slot_size(DCMotorActuator)
 
 
-OURS = (*USER_HEADER, *DCMotorActuator().numbers)
+OURS = (*USER_HEADER, *DCMotorActuator().parameter_values)
 
 
 def general(user=(), actdim=SIZE, **kinds):

@@ -91,9 +91,9 @@ def test_a_servo_too_slow_for_its_gain_raises_and_names_a_stable_step():
 class Spring(ActuatorModel):
     """Custom family that closes a loop over position and speed without declaring it."""
 
-    stiffness: float = real(1.0, least=0.0)
-    damping: float = real(0.0, least=0.0)
-    dry: float = real(0.0, least=0.0)
+    stiffness: float = real(1.0, minimum=0.0)
+    damping: float = real(0.0, minimum=0.0)
+    dry: float = real(0.0, minimum=0.0)
 
     @staticmethod
     def advance(parameters, timestep, state, inputs: Inputs):  # noqa: ARG004

@@ -8,7 +8,7 @@ from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.engine import uninstall
 from codrl_mj.engine.families import slot_size
 from codrl_mj.physics import motors
-from codrl_mj.physics.mjcf import drive
+from codrl_mj.physics.mjcf import configure_actuator
 from tests.engine.models import FULL, STATE, changed, controls, trajectory
 from tests.reference import MotorSimulation
 
@@ -58,7 +58,7 @@ def _spec(with_ours=True):
     </mujoco>""")
     if with_ours:
         for name, actuator in OURS.items():
-            drive(spec.actuator(name), actuator, 0.5 if name == "third" else None)
+            configure_actuator(spec.actuator(name), actuator, 0.5 if name == "third" else None)
         spec.actuator("second").group = 2
     return spec
 

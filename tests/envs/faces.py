@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from codrl_mj import Choice, LogUniform, Uniform, make_sb3_vec_env, suite
 from codrl_mj.envs import ActuatedEnv, SerialVectorEnv
-from codrl_mj.physics.variation import bare_model, variable
+from codrl_mj.physics.variation import bare_model, variable_names
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.disturbances.everything import MOST, RUBBED, imperfect
 from tests.engine.models import FULL, changed
@@ -51,7 +51,11 @@ def commanded(task, command):
 
 def scales(task):
     """Return a distribution for each scale factor of a task's model."""
-    return {name: Uniform(0.6, 1.7) for name in variable(bare_model(task)) if "damping" not in name}
+    return {
+        name: Uniform(0.6, 1.7)
+        for name in variable_names(bare_model(task))
+        if "damping" not in name
+    }
 
 
 def everything(task, physics):

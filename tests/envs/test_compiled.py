@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from codrl_mj import Uniform
-from codrl_mj.actuators import IDEAL, DCMotorActuator, actuator_over
+from codrl_mj.actuators import IDEAL, DCMotorActuator, override_actuator
 from codrl_mj.engine.families import signals_offset
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.compiled import compiled_env
@@ -48,7 +48,7 @@ def _env(task, setup="motor", **options):
     ):
         arguments |= {"levels": (-3.0, 0.0, 3.0)}
     if arguments.get("actuator") is NOISY:
-        arguments |= {"actuator": actuator_over(named_actuator("paper", task), NOISY)}
+        arguments |= {"actuator": override_actuator(named_actuator("paper", task), NOISY)}
     return ActuatedEnv(task, **arguments)
 
 

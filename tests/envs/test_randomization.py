@@ -135,7 +135,9 @@ def test_the_drawn_actuator_is_simulated(task, physics):
             )
         final_states.add(tuple(ours.state))
         if physics == "mujoco":
-            assert tuple(ours.model.actuator_user[0, USER_HEADER_SIZE:]) == actuator.numbers
+            assert (
+                tuple(ours.model.actuator_user[0, USER_HEADER_SIZE:]) == actuator.parameter_values
+            )
     assert len(final_states) == 4
 
 
@@ -465,7 +467,7 @@ def test_an_unstable_nominal_actuator_is_accepted_if_its_draws_are_stable():
 
 def test_spectral_radii_do_not_depend_on_the_batch():
     generator = np.random.default_rng(0)
-    vectors = np.array([DCMotorActuator().numbers] * 300)
+    vectors = np.array([DCMotorActuator().parameter_values] * 300)
     vectors[:, 4:8] = generator.uniform(0.0, [20.0, 50.0, 0.05, 1.0], (300, 4))
     vectors[generator.random(300) < 0.3, 5] = 0.0
     vectors[generator.random(300) < 0.3, 6] = 0.0
@@ -483,7 +485,7 @@ def test_spectral_radii_do_not_depend_on_the_batch():
 
 def test_the_fast_stability_test_agrees_with_the_spectral_radius():
     generator = np.random.default_rng(1)
-    vectors = np.array([DCMotorActuator().numbers] * 20000)
+    vectors = np.array([DCMotorActuator().parameter_values] * 20000)
     vectors[:, 0:2] = np.exp(generator.uniform(-3.0, 1.0, (20000, 2)))
     vectors[:, 4:7] = np.exp(generator.uniform(-9.0, 4.0, (20000, 3))) * (1.0, 1.0, 1e-3)
     vectors[generator.random(20000) < 0.3, 5] = 0.0
@@ -500,7 +502,7 @@ def test_the_fast_stability_test_agrees_with_the_spectral_radius():
     assert np.isin(quick, (0.0, np.inf)).mean() > 0.8
     edge = np.array(
         [
-            DCMotorActuator(controller=CurrentLoop(kp=kp)).numbers
+            DCMotorActuator(controller=CurrentLoop(kp=kp)).parameter_values
             for kp in 9.0 + np.linspace(-1e-9, 1e-9, 401)
         ]
     )

@@ -105,7 +105,7 @@ VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
         ),
         ({"actuator": {"supply": {"resistance": 9.0}}}, "supply.resistance = 9: must be < "),
         ({"physics": "analytic", "joint": {"damping": 0.1}}, "use physics='mujoco'"),
-        ({"physics": "analytic", "joint": {"friction": 0.1}}, "no place for it"),
+        ({"physics": "analytic", "joint": {"friction": 0.1}}, "no term for it"),
         ({"physics": "analytic", "joint": {"armature": 0.1}}, "joint.armature = 0.1"),
         (
             {"render_mode": "rgb_array", "camera": "fixd"},
@@ -356,7 +356,7 @@ def test_raises_for_fields_that_cannot_be_drawn(make, randomize, message):
         ),
         (
             {**VOLTAGE, "randomize": {"controller.kp": Uniform(1, 2)}},
-            "the command goes past the controller",
+            "the command bypasses the controller",
         ),
         (
             {"actuator": GEARED, "randomize": {"motor.gear_ratio": Uniform(0, 1)}},

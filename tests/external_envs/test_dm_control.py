@@ -114,7 +114,7 @@ MAXON = {".*": "maxon-ec45-flat-50w"}
 
 
 def test_current_commands_are_in_amperes():
-    motor = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
+    motor = Drive.from_motor_parameters(motor_entry("maxon-ec45-flat-50w").parameters).replaced(
         {"controller.max_current": 5.0}
     )
     env = codrl_mj.make_dm_control(

@@ -41,9 +41,9 @@ def test_randomization_does_not_change_the_initial_states():
 
 def test_a_drawn_motor_equals_one_with_these_values_from_the_start():
     fields = {"motor.rotor_inertia": 3e-5, "motor.coulomb_friction": 0.02, "motor.gear_ratio": 1.5}
-    drawn_motor = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
-        fields | {"motor.resistance": 1.1}
-    )
+    drawn_motor = Drive.from_motor_parameters(
+        motor_entry("maxon-ec45-flat-50w").parameters
+    ).replaced(fields | {"motor.resistance": 1.1})
     draws = {".*": {name: codrl_mj.Choice([value]) for name, value in fields.items()}}
     draws[".*"]["motor.resistance"] = "choice(1.1)"
     randomized_env, reference_env = (

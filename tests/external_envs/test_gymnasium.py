@@ -295,7 +295,7 @@ def test_observations_end_with_the_sensor_values():
 def test_current_commands_are_in_amperes_up_to_the_motors_limits():
     drives = {
         "b.*": (
-            Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
+            Drive.from_motor_parameters(motor_entry("maxon-ec45-flat-50w").parameters).replaced(
                 {"controller.max_current": 5.0}
             )
         )
@@ -315,7 +315,9 @@ def test_current_commands_are_in_amperes_up_to_the_motors_limits():
 
 def test_a_current_command_does_not_depend_on_gain_arm_and_limit():
     fields = {"controller.max_current": 5.0, "motor.gear_ratio": 3.0, "motor.arm_radius": 0.5}
-    drive = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(fields)
+    drive = Drive.from_motor_parameters(motor_entry("maxon-ec45-flat-50w").parameters).replaced(
+        fields
+    )
     env = codrl_mj.make(ARM_ID, {"motor": drive}, action="current", allow_unstable=True)
     assert env.action_space.high[1] == 5.0
     env.reset(seed=0)

@@ -130,7 +130,7 @@ def test_a_file_assigns_actuators_to_patterns(tmp_path):
     (tmp_path / "train.yaml").write_text(text + "agent: {name: sac, gamma: 0.98}\n")
     train_config = read_config(tmp_path / "train.yaml")
     assert train_config.env.actuators_by_name == {
-        "b.*": Drive.of(motor_entry("maxon-ec45-flat-50w").numbers),
+        "b.*": Drive.from_motor_parameters(motor_entry("maxon-ec45-flat-50w").parameters),
         "f.*": Lag(),
     }
     assert train_config.env.make().unwrapped.frame_skip == 2
@@ -153,7 +153,7 @@ def test_a_file_assigns_actuators_to_patterns(tmp_path):
         ),
         (
             {"task": "HalfCheetah-v5", "actuator": "paper"},
-            "of which the environment HalfCheetah-v5 has none",
+            "but the environment HalfCheetah-v5 has none",
         ),
         ({"task": "HalfCheetah-v5", "max_episode_steps": 0}, "must be an integer >= 1"),
         ({"task": "HalfCheetah-v5", "options": {"frame_skip": {1, 2}}}, "that JSON can hold"),

@@ -9,7 +9,7 @@ from codrl_mj.actuators import Drive, resolve
 from codrl_mj.catalogue import motor_entry
 from codrl_mj.identify import Log, identify
 
-MX = Drive.of(motor_entry("dynamixel-mx-64").numbers)
+MX = Drive.from_motor_parameters(motor_entry("dynamixel-mx-64").parameters)
 MASS, ARM = 0.6, 0.15
 MGL, LOAD = MASS * 9.81 * ARM, MASS * ARM**2
 STEP, ROWS = 5e-4, 4

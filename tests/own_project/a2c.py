@@ -18,7 +18,7 @@ class A2CConfig(DeepAgentConfig):
 
     learning_rate: float = real(7e-4, above=0)
     """Step size of RMSProp, > 0."""
-    rollout_steps: int = integer(8, least=1)
+    rollout_steps: int = integer(8, minimum=1)
     """Steps of each environment between two updates, >= 1."""
 
     def make_model(self, env: Any, seed: int) -> Any:

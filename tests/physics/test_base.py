@@ -1,4 +1,4 @@
-"""Integration steps, integrators and the check for divergence."""
+"""Integration steps, integrators, and detection of divergence."""
 
 import re
 
@@ -14,7 +14,7 @@ FIELDS = {"body_mass": np.ones((1, 2)), "body_ipos": np.zeros((1, 2, 3))}
 
 
 @every_task
-def test_steps_are_the_papers_inner_loop_with_a_motor_and_gymnasiums_without_unless_they_are_given(
+def test_default_steps_are_the_papers_with_a_motor_and_gymnasiums_without(
     task,
 ):
     assert task.num_inner_steps(DCMotorActuator(), None, None) == task.motor_inner_steps
@@ -26,7 +26,7 @@ def test_steps_are_the_papers_inner_loop_with_a_motor_and_gymnasiums_without_unl
 
 @every_task
 @pytest.mark.parametrize("ratio", [0.5, 1.001, 1.5, 2.5, 9.99])
-def test_a_timestep_that_does_not_divide_is_refused_with_both_numbers(task, ratio):
+def test_raises_with_both_numbers_if_a_timestep_does_not_divide(task, ratio):
     timestep = task.step_duration / ratio
     with pytest.raises(
         ValueError, match=rf"{timestep:g} s does not divide .*{task.step_duration:g} s"
@@ -36,7 +36,7 @@ def test_a_timestep_that_does_not_divide_is_refused_with_both_numbers(task, rati
 
 
 @every_task
-def test_the_default_integrator_is_the_first_and_others_are_refused_with_the_choice(task):
+def test_the_default_integrator_is_the_first_and_unknown_ones_raise(task):
     assert task.integrator(None) == task.integrators[0]
     for name in task.integrators:
         assert task.integrator(name) == name
@@ -48,7 +48,7 @@ def test_the_default_integrator_is_the_first_and_others_are_refused_with_the_cho
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1.1e10, -1e39])
 @every_task
-def test_divergence_names_every_broken_entry_and_the_time(task, bad):
+def test_divergence_reports_all_invalid_entries_and_the_time(task, bad):
     physics = AnalyticPhysics(SimulationConfig(task, [IDEAL]))
     physics.time = 1.25
     physics.check_finite()
@@ -63,17 +63,17 @@ def test_divergence_names_every_broken_entry_and_the_time(task, bad):
             physics.check_finite()
 
 
-def test_a_physics_without_a_model_refuses_its_fields_by_its_own_name(monkeypatch):
-    class Mine(AnalyticPhysics):
-        """Of nobody else."""
+def test_raises_with_its_name_if_a_physics_has_no_model_fields(monkeypatch):
+    class Custom(AnalyticPhysics):
+        """Custom physics."""
 
     plant = SimulationConfig(TASKS["pendulum"], [IDEAL])
-    said = (
-        "fields = body_mass, body_ipos: they are a MuJoCo model's, which {!r} has not; use 'mujoco'"
+    message = (
+        "fields = body_mass, body_ipos: only a MuJoCo model has such fields, not {!r}; use 'mujoco'"
     )
-    for make, name in ((AnalyticPhysics, "analytic"), (Mine, "Mine")):
-        with pytest.raises(ValueError, match=said.format(name)):
+    for make, name in ((AnalyticPhysics, "analytic"), (Custom, "Custom")):
+        with pytest.raises(ValueError, match=message.format(name)):
             make(plant).set_model(FIELDS)
-    monkeypatch.setitem(PHYSICS, "mine", Mine)
-    with pytest.raises(ValueError, match="which 'mine' has not"):
-        Mine(plant).set_model(FIELDS)
+    monkeypatch.setitem(PHYSICS, "mine", Custom)
+    with pytest.raises(ValueError, match="fields, not 'mine'"):
+        Custom(plant).set_model(FIELDS)

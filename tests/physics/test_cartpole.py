@@ -1,4 +1,4 @@
-"""CartPole on both physics, and its asset, against the installed Gymnasium."""
+"""CartPole with both physics, and its model, against the installed Gymnasium."""
 
 import gymnasium
 import mujoco
@@ -17,7 +17,7 @@ every_integrator = pytest.mark.parametrize("integrator", ["euler", "semi-implici
 
 
 def _gymnasiums_step(integrator, timestep):
-    """Gymnasium's step of that length, as a function of state and force."""
+    """Return Gymnasium's step of that duration, as a function of state and force."""
     env = gymnasium.make("CartPole-v1").unwrapped
     env.kinematics_integrator, env.tau = integrator, timestep
 
@@ -32,7 +32,7 @@ def _gymnasiums_step(integrator, timestep):
 @every_physics
 @every_integrator
 @pytest.mark.parametrize("inner_steps", [1, 5])
-def test_steps_are_gymnasiums_of_a_fraction_of_the_time(physics, integrator, inner_steps):
+def test_integration_steps_equal_short_steps_of_gymnasium(physics, integrator, inner_steps):
     simulation = physics(SimulationConfig(TASK, [IDEAL], inner_steps, integrator))
     step = _gymnasiums_step(integrator, 0.02 / inner_steps)
     generator = np.random.default_rng(0)
@@ -49,7 +49,7 @@ def test_steps_are_gymnasiums_of_a_fraction_of_the_time(physics, integrator, inn
         )
 
 
-def test_the_asset_has_gymnasiums_inertias_and_the_papers_actuator():
+def test_the_model_has_gymnasiums_inertias_and_the_papers_actuator():
     env = gymnasium.make("CartPole-v1").unwrapped
     model = mujoco.MjModel.from_xml_path(str(asset_path("cartpole.xml")))
     assert model.body("cart").mass == env.masscart

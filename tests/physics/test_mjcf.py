@@ -1,4 +1,4 @@
-"""An actuator written into an MJCF model and read back, and what is refused."""
+"""Actuators written into an MJCF model and read back, and errors."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ from codrl_mj.disturbances import Joint
 from codrl_mj.engine import motors
 from codrl_mj.engine.families import USER_HEADER_SIZE, slot_size, user_header
 from codrl_mj.physics import MujocoPhysics, SimulationConfig
-from codrl_mj.physics.mjcf import drive, task_model
+from codrl_mj.physics.mjcf import configure_actuator, task_model
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.tasks import TASKS
 from codrl_mj.user_code import asset_path
@@ -40,33 +40,31 @@ XML = """
 
 def _spec(actuator=None, max_force=None):
     spec = mujoco.MjSpec.from_string(XML)
-    drive(spec.actuator("drive"), actuator or DCMotorActuator(), max_force)
+    configure_actuator(spec.actuator("drive"), actuator or DCMotorActuator(), max_force)
     return spec
 
 
 @given(of_every_family, st.none() | st.floats(1e-3, 1e3))
-def test_every_family_comes_back_as_it_was_written_and_the_ideal_one_is_none_of_ours(
-    actuator, max_force
-):
+def test_every_family_round_trips_and_the_ideal_actuator_is_plain(actuator, max_force):
     engine.load_family(type(actuator))
     model = _spec(actuator, max_force).compile()
-    found = motors(model)
-    assert {index: type(one) for index, one in found.items()} == (
+    actuators = motors(model)
+    assert {index: type(read_actuator) for index, read_actuator in actuators.items()} == (
         {} if actuator == IDEAL else {0: type(actuator)}
     )
-    for one in found.values():
-        assert one.numbers == actuator.numbers
-        assert one.arm_radius == pytest.approx(
-            actuator.arm_radius, rel=1e-15
-        )  # through gear = 1/arm
+    # The arm is stored as gear = 1/arm.
+    for read_actuator in actuators.values():
+        assert read_actuator.parameter_values == actuator.parameter_values
+        assert read_actuator.arm_radius == pytest.approx(actuator.arm_radius, rel=1e-15)
     assert model.actuator_ctrllimited[0] == (max_force is not None)
-    if max_force is not None:  # the largest torque at the shaft
+    # The limit is the largest torque at the shaft.
+    if max_force is not None:
         limit = max_force * actuator.arm_radius
         np.testing.assert_array_equal(model.actuator_ctrlrange, [[-limit, limit]])
 
 
-def test_a_motor_s_arm_and_limits_are_its_own_behind_an_actuator_of_several_outputs(tmp_path):
-    """One as it was compiled, one exchanged afterwards, and one of a batch."""
+def test_arm_and_limits_are_correct_after_an_actuator_with_several_outputs(tmp_path):
+    """Check a compiled, a replaced and a batched actuator."""
     asset, text = tmp_path / "pendulum.xml", asset_path("pendulum.xml").read_text()
     for mark, beside in (
         ("<worldbody>", '<site name="base"/>'),
@@ -94,9 +92,9 @@ def test_a_motor_s_arm_and_limits_are_its_own_behind_an_actuator_of_several_outp
         np.testing.assert_array_equal(batch.field(field)[0], getattr(compiled.model, field))
 
 
-def test_the_ideal_actuator_is_a_plain_motor_of_gear_one_whatever_was_there_before():
+def test_the_ideal_actuator_replaces_everything_by_a_plain_motor_of_gear_one():
     spec = _spec(DCMotorActuator(Motor(arm_radius=0.2)), 3.0)
-    drive(spec.actuator("drive"), IDEAL, None)
+    configure_actuator(spec.actuator("drive"), IDEAL, None)
     model, plain = spec.compile(), mujoco.MjModel.from_xml_string(XML)
     assert (
         motors(model) == motors(plain) == motors(mujoco.MjModel.from_xml_string("<mujoco/>")) == {}
@@ -117,16 +115,18 @@ def test_the_ideal_actuator_is_a_plain_motor_of_gear_one_whatever_was_there_befo
         )
 
 
-def test_motors_are_found_by_their_index_in_order():
+def test_motors_are_read_by_index_in_order():
     spec = _spec()
     for index in range(3):
         driver = spec.add_actuator(
             name=f"extra{index}", trntype=mujoco.mjtTrn.mjTRN_JOINT, target="hinge"
         )
         if index != 1:
-            drive(driver, DCMotorActuator(controller=CurrentLoop(kp=float(index + 2))), None)
-    found = motors(spec.compile())
-    assert {index: actuator.controller.kp for index, actuator in found.items()} == {
+            configure_actuator(
+                driver, DCMotorActuator(controller=CurrentLoop(kp=float(index + 2))), None
+            )
+    actuators = motors(spec.compile())
+    assert {index: actuator.controller.kp for index, actuator in actuators.items()} == {
         0: 1.0,
         1: 2.0,
         3: 4.0,
@@ -154,9 +154,7 @@ def test_motors_are_found_by_their_index_in_order():
     ],
 )
 @pytest.mark.parametrize(("name", "called"), [("drive", "drive"), ("", "actuator 0")])
-def test_a_motor_that_would_not_run_as_described_is_refused_by_name(
-    name, called, field, value, message
-):
+def test_raises_with_the_name_of_an_inconsistent_motor(name, called, field, value, message):
     spec = _spec()
     spec.actuator("drive").name = name
     model = spec.compile()
@@ -172,7 +170,7 @@ def test_a_motor_that_would_not_run_as_described_is_refused_by_name(
         motors(model)
 
 
-def test_user_data_too_short_for_a_motor_is_refused():
+def test_raises_if_the_user_data_is_too_short():
     user = " ".join(map(repr, [*user_header(DCMotorActuator), 1]))
     short = XML.replace(
         '<motor name="drive" joint="hinge"/>',
@@ -181,21 +179,21 @@ def test_user_data_too_short_for_a_motor_is_refused():
     )
     with pytest.raises(
         ValueError,
-        match=r"drive: user = .*: a Actuator needs 3 numbers and resistance, inductance, ",
+        match=r"drive: user = .*: a DCMotorActuator needs 3 numbers and resistance, inductance, ",
     ):
         motors(mujoco.MjModel.from_xml_string(short))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Heavy(Lag):
-    """A lag with a rotor."""
+    """Lag with a rotor."""
 
     family = ""
     additions = JointAdditions(armature=1.0, damping=2.0, friction=3.0)
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_what_actuator_and_environment_add_to_the_joint_is_summed_there_alone(task):
+def test_additions_of_actuator_and_environment_are_summed_at_the_joint(task):
     plain, added = (
         task_model(SimulationConfig(TASKS[task], (actuator,), joint=joint))
         for actuator, joint in (

@@ -1,4 +1,4 @@
-"""Streams draw and save as NumPy's generators do one by one; how environments use them, the faces' tests see."""
+"""Streams against single NumPy generators: draws and states."""
 
 import numpy as np
 from gymnasium.utils import seeding
@@ -9,13 +9,13 @@ SIZE = 5
 
 
 def _seeded():
-    """Streams with seeds, and the same generators one by one."""
+    """Return seeded streams, and the same generators separately."""
     streams = Streams(SIZE)
     streams.seed(np.arange(SIZE), list(range(SIZE)))
     return streams, [seeding.np_random(seed)[0] for seed in range(SIZE)]
 
 
-def test_draws_are_numpys_one_by_one_from_any_rows_in_any_order_and_between_the_users_own():
+def test_draws_equal_those_of_single_generators():
     streams, generators = _seeded()
     for rows, count in (
         ([0, 1, 2, 3, 4], 3),
@@ -34,13 +34,14 @@ def test_draws_are_numpys_one_by_one_from_any_rows_in_any_order_and_between_the_
             np.testing.assert_array_equal(stream.normal(size=4), generator.normal(size=4))
 
 
-def test_unseeded_streams_differ_from_each_other():
+def test_unseeded_streams_differ():
     assert len(np.unique(Streams(SIZE).random(np.arange(SIZE), 1))) == SIZE
 
 
-def test_the_state_is_numpys_and_restores_every_draw_spare_half_included():
+def test_the_state_restores_every_draw_including_the_spare_half():
     streams, _ = _seeded()
-    streams.generators[1].integers(10, dtype=np.int32)  # leaves half of a 64-bit draw for the next
+    # This leaves half of a 64-bit draw for the next one.
+    streams.generators[1].integers(10, dtype=np.int32)
     state = streams.state()
     assert (state.shape, state.dtype) == ((SIZE, WORDS), np.uint64)
     for row, generator in zip(state.tolist(), streams.generators, strict=True):
@@ -49,12 +50,13 @@ def test_the_state_is_numpys_and_restores_every_draw_spare_half_included():
         assert row[2] << 64 | row[3] == pcg["state"]["inc"]
         assert row[4:] == [pcg["has_uint32"], pcg["uinteger"]]
     assert (state[0, 4], state[1, 4]) == (0, 1)
-    kept, other = state.copy(), Streams(SIZE)
-    other.set_state(state)
+    copy_of_state, second = state.copy(), Streams(SIZE)
+    second.set_state(state)
     for _ in range(3):
-        for stream, again in zip(streams.generators, other.generators, strict=True):
-            assert stream.integers(1000, dtype=np.int32) == again.integers(1000, dtype=np.int32)
+        for stream, restored in zip(streams.generators, second.generators, strict=True):
+            assert stream.integers(1000, dtype=np.int32) == restored.integers(1000, dtype=np.int32)
     np.testing.assert_array_equal(
-        streams.random(np.arange(SIZE), 4), other.random(np.arange(SIZE), 4)
+        streams.random(np.arange(SIZE), 4), second.random(np.arange(SIZE), 4)
     )
-    np.testing.assert_array_equal(state, kept)  # a copy
+    # The state is a copy.
+    np.testing.assert_array_equal(state, copy_of_state)

@@ -1,6 +1,6 @@
-"""The trace of the integration steps within an environment step: what it says of saturation, and of no actuator.
+"""Trace of the integration steps in an environment step: saturation, and the ideal actuator.
 
-Against the reference motor, row by row, it is in `tests/envs/test_wiring.py`.
+`tests/envs/test_wiring.py` compares it row by row with the reference motor.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ every_kind = pytest.mark.parametrize("kind", [MujocoPhysics, AnalyticPhysics])
 
 
 def _rows(kind, actuator):
-    """The traces of twenty steps under random forces, one below the other, and the forces."""
+    """Return the traces of twenty steps under random forces, stacked, and the forces."""
     physics, forces, rows = (
         kind(SimulationConfig(TASK, [actuator], 3, "euler")),
         np.random.default_rng(0).uniform(-10, 10, 20),
@@ -29,7 +29,7 @@ def _rows(kind, actuator):
 
 
 @every_kind
-def test_an_ideal_actuator_delivers_what_is_desired_and_has_no_current(kind):
+def test_an_ideal_actuator_delivers_the_desired_force_without_a_current(kind):
     rows, forces = _rows(kind, IDEAL)
     np.testing.assert_array_equal(rows[:, DESIRED], forces)
     np.testing.assert_array_equal(rows[:, ACTUAL], forces)
@@ -38,15 +38,14 @@ def test_an_ideal_actuator_delivers_what_is_desired_and_has_no_current(kind):
 
 
 @every_kind
-def test_the_integration_steps_are_marked_in_which_the_voltage_is_at_its_sagging_limit(kind):
+def test_integration_steps_at_the_voltage_limit_are_marked(kind):
     limit, supply_resistance = 2.0, 0.8
     loop = CurrentLoop(kp=2.0, max_voltage=limit)
     rows, _ = _rows(
         kind, DCMotorActuator(Motor(arm_radius=0.15), loop, Supply(resistance=supply_resistance))
     )
-    before = np.append(
-        0.0, rows[:-1, CURRENT]
-    )  # the supply sags by the current at the step's start
+    # The supply drops with the current at the start of the step.
+    before = np.append(0.0, rows[:-1, CURRENT])
     available = limit - supply_resistance * np.abs(before)
     expected = np.abs(rows[:, VOLTAGE]) >= available * (1 - 1e-12)
     np.testing.assert_array_equal(rows[:, SATURATED].astype(bool), expected)

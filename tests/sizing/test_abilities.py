@@ -1,4 +1,4 @@
-"""What a drive can do: datasheets, and the drive itself when more is asked of it than it can give."""
+"""Limits of drives, against datasheets and against the simulated drive under excessive commands."""
 
 import dataclasses
 import math
@@ -16,26 +16,29 @@ from codrl_mj.sizing import (
     explain,
     find_drive,
     find_entry,
-    respond,
+    simulate_loop,
     torque_limits,
 )
 
 
 @pytest.mark.parametrize("name", motor_names())
-def test_stall_and_no_load_are_what_the_datasheet_prints(name):
+def test_stall_and_no_load_agree_with_the_datasheet(name):
     entry = motor_entry(name)
-    can, printed = abilities(Drive.of(entry.numbers)), entry.datasheet.readings()
-    ratio = entry.numbers.gear_ratio
+    can, printed = (
+        abilities(Drive.from_motor_parameters(entry.parameters)),
+        entry.datasheet.readings(),
+    )
+    ratio = entry.parameters.gear_ratio
     for field, ours in (("stall_torque", can.stall_torque), ("no_load_speed", can.no_load_speed)):
         if field in printed:
             at_motor = printed[field].shaft == "motor"
-            seen = (
+            computed = (
                 printed[field].value * (ratio if field == "stall_torque" else 1 / ratio) ** at_motor
             )
-            assert ours == pytest.approx(seen, rel=entry.tolerance), field
+            assert ours == pytest.approx(computed, rel=entry.tolerance), field
 
 
-def test_a_motor_of_which_nothing_is_printed_twice_does_exactly_what_is_printed():
+def test_a_motor_without_redundant_values_reproduces_its_datasheet_exactly():
     can = abilities(find_drive("pololu-37d-30"))
     assert can.stall_torque == pytest.approx(140e-3 * 9.80665, rel=1e-9)  # 140 kgf*mm
     assert can.no_load_speed == pytest.approx(330 * 2 * math.pi / 60, rel=1e-9)  # 330 rpm
@@ -43,18 +46,22 @@ def test_a_motor_of_which_nothing_is_printed_twice_does_exactly_what_is_printed(
     assert math.isnan(can.mechanical_time_constant)
 
 
-@pytest.mark.parametrize("most", [math.inf, 1.0], ids=["voltage alone", "and current"])
+@pytest.mark.parametrize("max_current", [math.inf, 1.0], ids=["voltage alone", "and current"])
 @pytest.mark.parametrize("sag", [0.0, 2.0, 10.0])
-def test_the_limits_are_where_the_drive_ends_up(most, sag):
-    """In all four quadrants, and beyond the no-load speed, where the back-EMF drives the current."""
-    drive = Drive(GearMotor(gear_ratio=3.0), SampledLoop(max_current=most), Supply(24.0, sag))
+def test_the_simulated_drive_settles_at_the_limits(max_current, sag):
+    """Compare all four quadrants, and speeds beyond the no-load speed."""
+    drive = Drive(
+        GearMotor(gear_ratio=3.0), SampledLoop(max_current=max_current), Supply(24.0, sag)
+    )
     speeds = np.linspace(-1.3, 1.3, 14) * 24.0 / 0.042
-    for bound, ask in zip(torque_limits(drive, speeds / 3.0, most), (-1e3, 1e3), strict=True):
-        ends = [respond(drive, np.full(100, ask), speed).current[-1] for speed in speeds]
+    for bound, ask in zip(
+        torque_limits(drive, speeds / 3.0, max_current), (-1e3, 1e3), strict=True
+    ):
+        ends = [simulate_loop(drive, np.full(100, ask), speed).current[-1] for speed in speeds]
         np.testing.assert_allclose(bound, 3.0 * 0.042 * np.array(ends), rtol=1e-6, atol=1e-9)
 
 
-def test_the_gear_takes_its_share_of_the_motor_s_torque_and_friction_of_what_is_left():
+def test_the_gear_s_efficiency_applies_before_friction():
     drive = Drive(
         GearMotor(
             gear_ratio=10.0, gear_efficiency=0.8, coulomb_friction=2e-3, viscous_friction=1e-5
@@ -73,7 +80,7 @@ LOSSY = GearMotor(
 
 
 def hinge(drive, inertia):
-    """A hinge behind a motor that is asked for all it can [compiled model, its data]."""
+    """Return the model and data of a hinge with a motor that gets the largest command."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.compiler.boundmass = 5e-5, 0.0
     body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
@@ -85,19 +92,19 @@ def hinge(drive, inertia):
     return model, data
 
 
-@pytest.mark.parametrize("most", [math.inf, 1.0], ids=["voltage alone", "and current"])
+@pytest.mark.parametrize("max_current", [math.inf, 1.0], ids=["voltage alone", "and current"])
 @pytest.mark.parametrize("share", [-1.2, -0.5, 0.01, 0.5, 0.9, 1.2])
-def test_the_limits_are_what_moves_a_hinge_in_the_engine(share, most):
-    """At speeds that a heavy load keeps, as shares of the no-load speed."""
-    drive = Drive(LOSSY, SampledLoop(max_current=most))
+def test_the_limits_are_the_net_torques_on_a_hinge_in_mujoco(share, max_current):
+    """At shares of the no-load speed, which a heavy load keeps constant."""
+    drive = Drive(LOSSY, SampledLoop(max_current=max_current))
     model, data = hinge(drive, 100.0)
     data.qvel[:] = share * abilities(drive).no_load_speed
     mujoco.mj_step(model, data, 200)
     speed = data.qvel[0]
     mujoco.mj_step(model, data)
     moved = data.qacc[0] * (100.0 + drive.additions.armature)
-    assert moved == pytest.approx(torque_limits(drive, speed, most)[1], rel=1e-5)
-    if share == 0.01 and most == math.inf:
+    assert moved == pytest.approx(torque_limits(drive, speed, max_current)[1], rel=1e-5)
+    if share == 0.01 and max_current == math.inf:
         assert moved == pytest.approx(abilities(drive).stall_torque, rel=0.02)
 
 
@@ -118,23 +125,23 @@ def test_the_limits_cross_zero_at_the_no_load_speed():
         assert torque_limits(drive, 0.0)[1] == pytest.approx(can.stall_torque, rel=1e-12)
 
 
-def test_what_a_largest_current_leaves_of_torque_and_power():
+def test_a_current_limit_reduces_torque_and_power():
     """At 12 V, 2 ohm, 0.1 N*m/A: 3 A make 3*(12 - 2*3) W, 1 A makes 1*(12 - 2*1) W."""
     motor = GearMotor(2.0, 1e-3, 0.1, 0.1, gear_ratio=5.0)
-    for most, amperes in ((math.inf, 3.0), (1.0, 1.0)):
-        can = abilities(Drive(motor, SampledLoop(max_current=most), Supply(12.0)))
+    for max_current, amperes in ((math.inf, 3.0), (1.0, 1.0)):
+        can = abilities(Drive(motor, SampledLoop(max_current=max_current), Supply(12.0)))
         assert can.power == pytest.approx(amperes * (12.0 - 2.0 * amperes))
-        assert can.peak_torque == pytest.approx(0.5 * min(most, 6.0))
+        assert can.peak_torque == pytest.approx(0.5 * min(max_current, 6.0))
         assert can.stall_torque == pytest.approx(3.0)
 
 
 @pytest.mark.parametrize(
-    ("drive", "said"),
+    ("drive", "text"),
     [
         (Drive(GearMotor(), SampledLoop(max_current=3.0), Supply(5.0)), ""),
         (
             Drive(GearMotor(), SampledLoop(max_current=3.0)),
-            "assumed, for none is given: supply.voltage = 24 V",
+            "assumed, because not specified: supply.voltage = 24 V",
         ),
         (
             Drive(GearMotor(rotor_inertia=0.0), SampledLoop(), Supply(5.0)),
@@ -143,18 +150,18 @@ def test_what_a_largest_current_leaves_of_torque_and_power():
         (Ideal(), ""),
     ],
 )
-def test_a_drive_says_what_is_assumed_of_it(drive, said):
-    assert said in drive.assumed
-    assert (said == "") == (drive.assumed == "")
+def test_a_drive_reports_its_assumptions(drive, text):
+    assert text in drive.assumed
+    assert (text == "") == (drive.assumed == "")
 
 
-def test_a_motor_without_back_emf_has_no_end_of_its_speed():
+def test_a_motor_without_back_emf_has_an_infinite_no_load_speed():
     can = abilities(Drive(GearMotor(back_emf_constant=0.0)))
     assert can.no_load_speed == math.inf
     assert can.no_load_current == 0.0
 
 
-def test_flags_are_set_over_the_named_drive(tmp_path):
+def test_flags_override_fields_of_the_named_drive(tmp_path):
     drive = find_drive("maxon-ec45-flat-50w", 12.0, 40e3, 1e3, 12.0, True, 8.0)
     assert (drive.motor.gear_ratio, drive.voltage_limit, drive.motor.rotor_inertia) == (
         12.0,
@@ -162,12 +169,12 @@ def test_flags_are_set_over_the_named_drive(tmp_path):
         pytest.approx(135e-7),
     )
     assert drive.controller == SampledLoop(40e3, 1e3, delayed=True, max_current=8.0)
-    own = tmp_path / "own.yaml"
-    own.write_text("family: drive\ncontroller: {delayed: true}\n")
-    assert find_drive(str(own)) == Drive(controller=SampledLoop(delayed=True))
-    assert not find_drive(str(own), delayed=False).controller.delayed
+    overridden = tmp_path / "own.yaml"
+    overridden.write_text("family: drive\ncontroller: {delayed: true}\n")
+    assert find_drive(str(overridden)) == Drive(controller=SampledLoop(delayed=True))
+    assert not find_drive(str(overridden), delayed=False).controller.delayed
     assert find_drive(drive) == drive
-    assert find_entry(str(own)) is None
+    assert find_entry(str(overridden)) is None
 
 
 @pytest.mark.parametrize(
@@ -190,12 +197,12 @@ def test_flags_are_set_over_the_named_drive(tmp_path):
         (("rev-neo", None, None, None, -1.0), r"Supply\.voltage = -1\.0: must be"),
     ],
 )
-def test_bad_input_is_refused(arguments, message):
+def test_raises_if_the_input_is_invalid(arguments, message):
     with pytest.raises(ValueError, match=message):
         find_drive(*arguments)
 
 
-def test_the_catalogue_in_rows_is_sorted_with_what_is_not_known_last():
+def test_catalogue_rows_are_sorted_with_unknown_values_last():
     rows = catalogue_rows("mechanical_time_constant")
     assert sorted(row["name"] for row in rows) == motor_names()
     known = [
@@ -215,32 +222,34 @@ def test_the_catalogue_in_rows_is_sorted_with_what_is_not_known_last():
 
 
 @pytest.mark.parametrize("name", motor_names())
-def test_every_number_is_explained(name):
+def test_explain_has_the_origin_of_every_number(name):
     entry = motor_entry(name)
-    found = explain(Drive.of(entry.numbers), entry)
-    shown = {row["name"]: row for row in found["numbers"]}
-    fields = {field.name for field in dataclasses.fields(entry.numbers)} - {
+    report = explain(Drive.from_motor_parameters(entry.parameters), entry)
+    shown = {row["name"]: row for row in report["numbers"]}
+    fields = {field.name for field in dataclasses.fields(entry.parameters)} - {
         "derived",
         "disagreements",
     }
-    assert shown.keys() | set(found["unknown"]) == fields
+    assert shown.keys() | set(report["unknown"]) == fields
     assert shown["inductance"]["unit"] == "H"
     for field, row in shown.items():
-        assert row["how"] == entry.numbers.derived[field]
+        assert row["how"] == entry.parameters.derived[field]
         if (
             "printed" in row["how"]
             and not row["how"].endswith("is printed")
             and field not in entry.estimated
         ):
             assert row["sources"], field
-    told = [
-        one for one in found["disagreements"] if not one.startswith("less than 1%, by rounding: ")
+    reported = [
+        line
+        for line in report["disagreements"]
+        if not line.startswith("less than 1%, by rounding: ")
     ]
-    large = [one for one in entry.numbers.disagreements if abs(one.difference) >= 0.01]
+    large = [item for item in entry.parameters.disagreements if abs(item.difference) >= 0.01]
     small = ", ".join(
-        one.quantity for one in entry.numbers.disagreements if abs(one.difference) < 0.01
+        item.quantity for item in entry.parameters.disagreements if abs(item.difference) < 0.01
     )
-    assert told == list(map(str, large))
-    assert found["disagreements"][len(told) :] == (
+    assert reported == list(map(str, large))
+    assert report["disagreements"][len(reported) :] == (
         [f"less than 1%, by rounding: {small}"] if small else []
     )

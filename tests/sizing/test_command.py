@@ -1,4 +1,4 @@
-"""`codrl-mj motor`: what it prints, writes and refuses."""
+"""The verbs of `codrl-mj motor`: output, files and refusals."""
 
 import json
 import re
@@ -33,12 +33,12 @@ inductance = "like others"
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
-    """Every test runs in an empty folder."""
+def in_an_empty_folder(tmp_path, monkeypatch):
+    """Run every test in an empty folder."""
     monkeypatch.chdir(tmp_path)
 
 
-def printed(capsys, *arguments):
+def printed_by(capsys, *arguments):
     assert main(["motor", *arguments]) == 0
     out, error = capsys.readouterr()
     assert error == ""
@@ -46,7 +46,7 @@ def printed(capsys, *arguments):
 
 
 def read(capsys, *arguments):
-    return json.loads(printed(capsys, *arguments, "--json"))
+    return json.loads(printed_by(capsys, *arguments, "--json"))
 
 
 def is_png(path):
@@ -54,7 +54,7 @@ def is_png(path):
 
 
 def test_list_has_every_motor(capsys):
-    text = printed(capsys, "list", "--sort", "stall_torque")
+    text = printed_by(capsys, "list", "--sort", "stall_torque")
     assert max(map(len, map(str.rstrip, text.splitlines()[:-1]))) <= 80
     first = [
         line.split()[0]
@@ -64,17 +64,19 @@ def test_list_has_every_motor(capsys):
     assert sorted(first) == motor_names()
     assert first[0] == "heinzmann-pmg-132"
     assert "mN·m/A" in text
-    found = read(capsys, "list")
-    rows = found["motors"]
-    assert found["units"]["stall_torque"] == "N*m"
-    assert set(found["units"]) == rows[0].keys() - {"name", "kind"}
+    content = read(capsys, "list")
+    rows = content["motors"]
+    assert content["units"]["stall_torque"] == "N*m"
+    assert set(content["units"]) == rows[0].keys() - {"name", "kind"}
     assert [row["name"] for row in rows] == motor_names()
     assert set(Abilities._fields) < rows[0].keys()
 
 
-def test_show_says_where_every_number_is_from(capsys):
+def test_show_prints_the_source_of_every_number(capsys):
     text = " ".join(
-        printed(capsys, "show", "pololu-37d-30", "--gear-ratio", "50", "--out", "pictures").split()
+        printed_by(
+            capsys, "show", "pololu-37d-30", "--gear-ratio", "50", "--out", "pictures"
+        ).split()
     )
     for part in (
         "Pololu 37D",
@@ -89,16 +91,16 @@ def test_show_says_where_every_number_is_from(capsys):
     assert "Not known: rotor inertia" in text
     assert is_png(Path("pictures/torque_speed.png"))
     content = read(capsys, "show", "rev-neo", "--voltage", "24")
-    assert any("torque_constant" in one for one in content["disagreements"])
+    assert any("torque_constant" in number for number in content["disagreements"])
     assert {"name": "supply.voltage", "value": 24.0, "unit": "V"} in content["drive"]
     assert {row["name"]: row["value"] for row in content["abilities"]}[
         "mechanical_time_constant"
     ] is None
 
 
-def test_show_takes_a_datasheet_of_one_s_own_and_any_drive(capsys):
+def test_show_accepts_a_custom_datasheet_and_any_drive(capsys):
     Path("own.toml").write_text(OWN)
-    text = printed(capsys, "show", "own.toml", "--out", ".")
+    text = printed_by(capsys, "show", "own.toml", "--out", ".")
     parts = (
         "we ours, brushed",
         "Abilities at its output, at 12 V",
@@ -107,17 +109,17 @@ def test_show_takes_a_datasheet_of_one_s_own_and_any_drive(capsys):
         "source 1",
     )
     assert sorted(parts, key=text.index) == list(parts)
-    found = read(capsys, "show", "own.toml")
-    assert {row["name"]: row["value"] for row in found["abilities"]}[
+    content = read(capsys, "show", "own.toml")
+    assert {row["name"]: row["value"] for row in content["abilities"]}[
         "stall_torque"
     ] == pytest.approx(0.12)
     assert "numbers" not in read(capsys, "show", "codrl_mj.actuators:Drive")
 
 
 def test_a_file_is_written_filled_in_and_shown(capsys):
-    printed(capsys, "new", "mine.toml")
+    printed_by(capsys, "new", "mine.toml")
     assert main(["motor", "new", "mine.toml"]) == 2
-    assert "mine.toml: is there already" in capsys.readouterr().err
+    assert "mine.toml: already exists" in capsys.readouterr().err
     assert main(["motor", "show", "mine.toml"]) == 2
     assert "datasheet.resistance is not printed" in capsys.readouterr().err
     text = Path("mine.toml").read_text()
@@ -129,16 +131,16 @@ def test_a_file_is_written_filled_in_and_shown(capsys):
     ):
         text = text.replace(f'\n{name} = ""', f'\n{name} = "{value}"')
     Path("mine.toml").write_text(text)
-    shown = printed(capsys, "show", "mine.toml")
+    shown = printed_by(capsys, "show", "mine.toml")
     assert "mine.toml: mine\n" in shown
-    assert "assumed, for none is given: supply.voltage = 24 V, motor.rotor_inertia = 0" in shown
+    assert "assumed, because not specified: supply.voltage = 24 V, motor.rotor_inertia = 0" in shown
     assert "-0.0%" not in shown
-    found = {row["name"]: row["value"] for row in read(capsys, "show", "mine.toml")["abilities"]}
-    assert found["peak_torque"] == pytest.approx(38.0 * 60.0 / (2.0 * np.pi * 340.0))
+    content = {row["name"]: row["value"] for row in read(capsys, "show", "mine.toml")["abilities"]}
+    assert content["peak_torque"] == pytest.approx(38.0 * 60.0 / (2.0 * np.pi * 340.0))
 
 
 def test_design_prints_the_gains_and_the_margins(capsys):
-    printed(capsys, "design", "quanser-qube-servo-2", "--bandwidth", "1500")
+    printed_by(capsys, "design", "quanser-qube-servo-2", "--bandwidth", "1500")
     arguments = (
         "design",
         "quanser-qube-servo-2",
@@ -148,7 +150,7 @@ def test_design_prints_the_gains_and_the_margins(capsys):
         "--out",
         "pictures",
     )
-    text = printed(capsys, *arguments)
+    text = printed_by(capsys, *arguments)
     assert "20000 Hz, a sample of delay: kp = 8.98171 V/A, ki = 78374 V/(A·s)" in text
     assert re.search(r"\*20 +1 ", text)
     assert "not possible: SampledLoop.bandwidth = 2000: must be <= 1591.55 Hz" in text
@@ -159,14 +161,14 @@ def test_design_prints_the_gains_and_the_margins(capsys):
     assert not read(capsys, *arguments[:4], "--no-delayed")["delayed"]
     assert "a sample lasts" not in text
     slow = " ".join(
-        printed(capsys, "design", "quanser-qube-servo-2", "--sample-rate", "2000").split()
+        printed_by(capsys, "design", "quanser-qube-servo-2", "--sample-rate", "2000").split()
     )
     assert "2000 Hz: a sample lasts 3.6 times the winding's L/R = 0.138 ms" in slow
     assert "take 2,414 Hz or more" in slow
 
 
-def test_step_compares_the_kinds_of_anti_windup(capsys):
-    text = printed(capsys, "step", "quanser-qube-servo-2", "--out", "pictures")
+def test_step_compares_all_kinds_of_anti_windup(capsys):
+    text = printed_by(capsys, "step", "quanser-qube-servo-2", "--out", "pictures")
     for word in ("back_calculation", "clamping", "none", "undershoot", f"{0.2 * 18.0 / 8.4:.4f} A"):
         assert word in text
     assert is_png(Path("pictures/step.png"))
@@ -189,7 +191,7 @@ def test_step_compares_the_kinds_of_anti_windup(capsys):
         ("new nothing.txt", "nothing.txt: must end in .toml"),
     ],
 )
-def test_bad_input_costs_one_line_and_leaves_nothing(capsys, arguments, message):
+def test_bad_input_prints_one_line_and_writes_nothing(capsys, arguments, message):
     assert main(["motor", *arguments.split()]) == 2
     error = capsys.readouterr().err
     assert error.startswith("codrl-mj: error: ")
@@ -198,10 +200,10 @@ def test_bad_input_costs_one_line_and_leaves_nothing(capsys, arguments, message)
     assert not list(Path.cwd().iterdir())
 
 
-def test_operating_points_are_laid_over_the_diagram():
+def test_operating_points_are_drawn_in_the_diagram():
     points = np.array([[800.0, 0.1], [-20.0, 2.0]])
     drive, entry = find_drive("maxon-ec45-flat-50w"), find_entry("maxon-ec45-flat-50w")
-    plot = torque_speed_diagram(drive, entry.numbers, points)
+    plot = torque_speed_diagram(drive, entry.parameters, points)
     curves = {curve.label: curve for curve in plot.curves}
     np.testing.assert_array_equal(
         np.column_stack([curves["operating points"].x, curves["operating points"].y]), points
@@ -216,20 +218,20 @@ def test_operating_points_are_laid_over_the_diagram():
 
 
 @pytest.mark.parametrize("verb", ["list", "show", "design", "step"])
-def test_every_verb_s_help_teaches_with_an_example(capsys, verb):
-    with pytest.raises(SystemExit) as done:
+def test_the_help_of_every_verb_has_an_example(capsys, verb):
+    with pytest.raises(SystemExit) as process:
         main(["motor", verb, "--help"])
-    assert done.value.code == 0
+    assert process.value.code == 0
     assert f"Example: codrl-mj motor {verb}" in " ".join(capsys.readouterr().out.split())
 
 
-def test_help_imports_no_library_that_draws_or_computes():
+def test_help_imports_no_large_library():
     program = (
         "import sys; from codrl_mj.cli import main\ntry: main(['motor', '--help'])\nexcept"
         " SystemExit: pass\nprint([name for name in ('matplotlib', 'control', 'pint', 'scipy',"
         " 'numba', 'torch') if name in sys.modules])"
     )
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
     )
-    assert done.stdout.splitlines()[-1] == "[]"
+    assert process.stdout.splitlines()[-1] == "[]"

@@ -1,4 +1,4 @@
-"""The judgment of a motor: the same for feasible and choose, and never against what trained policies did with it."""
+"""Judgments of motors: equal in `feasible` and `choose`, and consistent with trained policies."""
 
 import csv
 import dataclasses
@@ -22,13 +22,13 @@ from codrl_mj.sizing import (
     SURELY_NOT,
     TRY_IT,
     choose,
+    demand_from_arrays,
     demand_of,
     demands_of,
-    equal_gears,
+    equivalent_gears,
     feasibility,
     find_drive,
-    geared,
-    recorded,
+    with_best_gear,
 )
 from codrl_mj.training import TrainConfig
 from tests.external_envs.models import ARM, ArmEnv
@@ -58,7 +58,7 @@ def furuta():
 
 @pytest.fixture
 def pololu(tmp_path):
-    """The datasheet of a geared motor: without the rotor's inertia, and with 10 g*cm^2."""
+    """Return the datasheet of a geared motor, without the rotor's inertia and with 10 g*cm^2."""
     files = tmp_path / "unknown.toml", tmp_path / "known.toml"
     files[0].write_text(POLOLU)
     files[1].write_text(f'{POLOLU}rotor_inertia = "10 g*cm^2 at motor"\n')
@@ -66,10 +66,12 @@ def pololu(tmp_path):
 
 
 def swinging(torque=0.1, amplitude=1.0, omega=4.0, **changes):
-    """A task's demand over one period: a torque with the angle's shape, at the joint."""
+    """Return a demand over one period of an oscillation, with a torque in phase with the angle."""
     time = np.linspace(0.0, 2.0 * math.pi / omega, 2001)
-    found = recorded(time, torque * np.cos(omega * time), amplitude * omega * np.cos(omega * time))
-    return dataclasses.replace(found, exact=False, **changes)
+    demand = demand_from_arrays(
+        time, torque * np.cos(omega * time), amplitude * omega * np.cos(omega * time)
+    )
+    return dataclasses.replace(demand, exact=False, **changes)
 
 
 def drive(voltage=24.0, **motor):
@@ -83,11 +85,11 @@ def drive(voltage=24.0, **motor):
     return Drive(GearMotor(**fields), SampledLoop(), Supply(voltage))
 
 
-# what trained policies did
+# -- trained policies ---
 
 
 def published():
-    """Task, actuator, score and success of each row of the two studies with a motor: 20 policies each."""
+    """Return task, actuator, score and success of every published row with a motor."""
     rows = {}
     for study in ("actuators", "insurance"):
         with (DOCS / "results" / study / "trials.csv").open() as file:
@@ -107,7 +109,7 @@ def published():
     ),
 )
 def test_no_published_row_contradicts_a_verdict(task):
-    """Surely: the policies score 0.9 or more; hopeless, surely not: those trained in any way fail."""
+    """Surely: the policies score 0.9 or more. Hopeless, surely not: all trained policies fail."""
     demand, verdicts = demand_of(task, episodes=2), []
     for (of, actuator), outcomes in published().items():
         if of != task:
@@ -127,8 +129,8 @@ def test_no_published_row_contradicts_a_verdict(task):
     assert TRY_IT in verdicts
 
 
-def test_no_policy_that_was_trained_for_it_contradicts_a_verdict(furuta):
-    """One seed each through a Pololu 37D, 12 V: docs/motor_verdicts.csv."""
+def test_no_policy_trained_through_the_motor_contradicts_a_verdict(furuta):
+    """Policies of one seed each, trained through a Pololu 37D at 12 V: docs/motor_verdicts.csv."""
     with (DOCS / "motor_verdicts.csv").open() as file:
         rows = list(csv.DictReader(file))
     for row in rows:
@@ -141,71 +143,74 @@ def test_no_policy_that_was_trained_for_it_contradicts_a_verdict(furuta):
             "gear_ratio",
         )
         numbers += ("gear_efficiency", "coulomb_friction", "viscous_friction")
-        found = feasibility(
+        judgment = feasibility(
             drive(float(row["voltage"]), **{name: float(row[name]) for name in numbers}),
             furuta,
             COOL,
         )
-        assert found.verdict == row["verdict"]
-        assert found.operation.own_share == pytest.approx(float(row["own_share"]), rel=0.05)
-        assert found.verdict != SURELY or float(row["success"]) >= 0.9
-        assert found.verdict not in (HOPELESS, SURELY_NOT) or float(row["success"]) <= 0.2
+        assert judgment.verdict == row["verdict"]
+        assert judgment.operation.own_share == pytest.approx(float(row["own_share"]), rel=0.05)
+        assert judgment.verdict != SURELY or float(row["success"]) >= 0.9
+        assert judgment.verdict not in (HOPELESS, SURELY_NOT) or float(row["success"]) <= 0.2
     assert {SURELY, TRY_IT} == {row["verdict"] for row in rows}
-    assert any(float(row["success"]) == 0.0 for row in rows)  # of what was once called surely
+    assert any(
+        float(row["success"]) == 0.0 for row in rows
+    )  # An earlier version judged this surely.
 
 
-# what rotor and friction take
+# -- rotor and friction ---
 
 
 def test_the_shares_of_rotor_and_friction_are_part_of_the_judgment():
-    """Inertia: N^2 J alpha over tau, which only the gear's square changes; friction: N tau_c over tau."""
+    """The inertia's share is N^2 J alpha over tau, the friction's N tau_c over tau."""
     demand = swinging()  # 0.1 N*m, 16 rad/s^2
     limit = 0.5 * 0.1 / 16.0
     for inertia, verdict in ((0.98 * limit, SURELY), (1.02 * limit, TRY_IT)):
         assert feasibility(drive(rotor_inertia=inertia), demand, COOL).verdict == verdict
     heavy = feasibility(drive(rotor_inertia=4.0 * limit, gear_ratio=3.0), demand, COOL)
-    (rotor,) = heavy.in_the_way
+    (rotor,) = heavy.failed_bounds
     assert (rotor.name, rotor.available) == ("rotor", 50.0)
     assert rotor.needed == pytest.approx(50.0 * 36.0, rel=1e-3)
-    assert "lower the gear to" not in rotor.remedy  # it would be 0.5
+    assert "lower the gear to" not in rotor.remedy  # The gear would be 0.5.
     within = feasibility(drive(rotor_inertia=limit / 4.0, gear_ratio=3.0), demand, COOL)
-    assert "lower the gear to 2, or let policies command voltage" in within.why
+    assert "lower the gear to 2, or let policies command voltage" in within.reason
     for friction, verdict in ((0.00249, SURELY), (0.00251, TRY_IT)):
         rubbing = drive(rotor_inertia=LIGHT, coulomb_friction=friction, gear_ratio=2.0)
         assert feasibility(rubbing, demand, COOL).verdict == verdict
     (rubs,) = feasibility(
         drive(rotor_inertia=LIGHT, coulomb_friction=0.01, gear_ratio=4.0), demand, COOL
-    ).in_the_way
+    ).failed_bounds
     assert rubs.needed == pytest.approx(40.0)
     assert "take a smaller motor, or train with it" in rubs.remedy
 
 
-def test_a_motor_of_which_policies_failed_is_not_sure_and_its_gears_are_told_apart(furuta, pololu):
-    """Each of these gears was surely; 18.75 lets policies that command torques end in 0 %."""
+def test_a_motor_on_which_policies_failed_is_not_judged_surely(furuta, pololu):
+    """An earlier version judged each gear surely; with 18.75, policies succeed in 0 %."""
     gears = (50.0, 6.25, 18.75, 30.0)
     choices = choose(furuta, [str(pololu[1])], gears=gears)
-    assert [one.ratio for one in choices] == pytest.approx(sorted(gears))
-    assert {one.feasibility.verdict for one in choices} == {TRY_IT}
-    shares = [one.feasibility.operation.own_share for one in choices]
+    assert [choice.ratio for choice in choices] == pytest.approx(sorted(gears))
+    assert {choice.feasibility.verdict for choice in choices} == {TRY_IT}
+    shares = [choice.feasibility.operation.own_share for choice in choices]
     assert shares == sorted(shares)
     assert shares[0] < 0.5 < 1.0 < shares[1] < 3.0 < shares[2]
     assert all(
-        "friction: Coulomb friction, share of the largest load" in one.lacks for one in choices
+        "friction: Coulomb friction, share of the largest load" in choice.rejection_reason
+        for choice in choices
     )
 
 
-# what nobody knows
+# -- unknown numbers ---
 
 
-def test_without_a_rotor_inertia_it_depends_on_one_that_is_said():
+def test_an_unknown_rotor_inertia_gives_it_depends_with_its_limit():
     demand = swinging()
     unknown = feasibility(drive(rotor_inertia=0.0), demand, COOL)
     assert unknown.verdict == DEPENDS
-    (rotor,) = unknown.in_the_way
+    (rotor,) = unknown.failed_bounds
     assert rotor.available == pytest.approx(0.5 * 0.1 / 16.0, rel=2e-3)
     assert (
         "its inertia is not known: give rotor_inertia, must be at most 0.00312 kg*m^2 at the motor"
-        in unknown.why
+        in unknown.reason
     )
     for share, verdict in ((0.99, SURELY), (1.01, TRY_IT)):
         assert (
@@ -213,49 +218,54 @@ def test_without_a_rotor_inertia_it_depends_on_one_that_is_said():
             == verdict
         )
     steady = dataclasses.replace(
-        recorded(np.arange(3.0), np.full(3, 0.1), np.full(3, 1.0)), exact=False
+        demand_from_arrays(np.arange(3.0), np.full(3, 0.1), np.full(3, 1.0)), exact=False
     )
     assert (
         feasibility(drive(rotor_inertia=0.0), steady, COOL).verdict == SURELY
-    )  # nothing accelerates
+    )  # Nothing accelerates.
 
 
-def test_without_a_continuous_current_it_depends_on_the_heat():
-    found = feasibility(drive(rotor_inertia=LIGHT), swinging())
-    assert found.verdict == DEPENDS
+def test_an_unknown_continuous_current_gives_it_depends_on_heat():
+    judgment = feasibility(drive(rotor_inertia=LIGHT), swinging())
+    assert judgment.verdict == DEPENDS
     rms = 0.1 / 0.05 / math.sqrt(2.0)
-    assert f"heat: its continuous current is not known, must be at least {rms:.3g} A" in found.why
+    assert (
+        f"heat: its continuous current is not known, must be at least {rms:.3g} A"
+        in judgment.reason
+    )
 
 
-# one judgment
+# -- the same judgment ---
 
 
-def test_feasible_and_choose_judge_alike_and_in_the_same_words(furuta, pololu, capsys, monkeypatch):
+def test_feasible_and_choose_give_the_same_judgment_and_text(furuta, pololu, capsys, monkeypatch):
     monkeypatch.setattr("codrl_mj.sizing.demand_of", lambda *_, **__: furuta)
     for name in (*map(str, pololu), "quanser-qube-servo-2", "maxon-re65"):
         (choice,) = choose(furuta, [name])
-        assert choice.feasibility.why in choice.lacks
+        assert choice.feasibility.reason in choice.rejection_reason
         assert (
             main(["motor", "feasible", name, "furuta", "--gear-ratio", f"{choice.ratio:.9g}"]) == 0
         )
         printed = " ".join(capsys.readouterr().out.split())
         assert printed.endswith(f" {choice.feasibility.verdict}")
-        for bound in choice.feasibility.in_the_way:
+        for bound in choice.feasibility.failed_bounds:
             assert str(bound) in printed
-            assert str(bound) in choice.lacks
+            assert str(bound) in choice.rejection_reason
 
 
-def test_the_best_gear_is_the_same_for_both_and_gears_nothing_up(furuta):
+def test_both_verbs_find_the_same_gear_with_a_ratio_of_at_least_1(furuta):
     ec45, re65 = (find_drive(name) for name in ("maxon-ec45-flat-50w", "maxon-re65"))
     for motor in (ec45, re65):
-        assert geared(motor, furuta).motor.gear_ratio >= 1.0
+        assert with_best_gear(motor, furuta).motor.gear_ratio >= 1.0
     (choice,) = choose(furuta, ["maxon-ec45-flat-50w"])
-    assert choice.ratio == pytest.approx(geared(ec45, furuta, 2.52).motor.gear_ratio, rel=0.02)
+    assert choice.ratio == pytest.approx(
+        with_best_gear(ec45, furuta, 2.52).motor.gear_ratio, rel=0.02
+    )
     best, demand = (
-        geared(find_drive("quanser-qube-servo-3"), swinging(1.0, 2.0)),
+        with_best_gear(find_drive("quanser-qube-servo-3"), swinging(1.0, 2.0)),
         swinging(1.0, 2.0),
     )
-    low, high = equal_gears(best, demand)
+    low, high = equivalent_gears(best, demand)
     verdict = feasibility(best, demand).verdict
     assert low < 1.0 / best.arm_radius < high
     for ratio, same in (
@@ -269,11 +279,11 @@ def test_the_best_gear_is_the_same_for_both_and_gears_nothing_up(furuta):
         ) == same
 
 
-def test_a_largest_current_counts_in_both(furuta, capsys, monkeypatch):
+def test_both_verbs_respect_a_largest_current(furuta, capsys, monkeypatch):
     monkeypatch.setattr("codrl_mj.sizing.demand_of", lambda *_, **__: furuta)
     (choice,) = choose(furuta, ["quanser-qube-servo-3"], max_current=0.2)
     assert choice.drive.controller.max_current == 0.2
-    assert "current: |i|, largest" in choice.lacks
+    assert "current: |i|, largest" in choice.rejection_reason
     assert (
         main(["motor", "feasible", "quanser-qube-servo-3", "furuta", "--max-current", "0.2"]) == 0
     )
@@ -282,7 +292,7 @@ def test_a_largest_current_counts_in_both(furuta, capsys, monkeypatch):
     assert printed.endswith(" try it")
 
 
-def test_gears_are_judged_on_the_command_line(tmp_path, pololu, furuta, capsys, monkeypatch):
+def test_the_command_line_judges_given_gears(tmp_path, pololu, furuta, capsys, monkeypatch):
     monkeypatch.setattr("codrl_mj.sizing.demands_of", lambda *_, **__: {"": furuta})
     line = [
         "motor",
@@ -295,7 +305,7 @@ def test_gears_are_judged_on_the_command_line(tmp_path, pololu, furuta, capsys, 
         "--out",
         str(tmp_path / "out"),
     ]
-    assert main(line) == 1  # none does it
+    assert main(line) == 1  # No gear is suitable.
     printed = " ".join(capsys.readouterr().out.split())
     assert "known.toml at gear 6.25: try it. friction" in printed
     assert "known.toml at gear 18.75: try it. rotor" in printed
@@ -308,33 +318,33 @@ def test_gears_are_judged_on_the_command_line(tmp_path, pololu, furuta, capsys, 
     assert "gear_ratio = 0" in capsys.readouterr().err
 
 
-# peaks and servos
+# -- peaks and servos ---
 
 
-def test_a_peak_is_not_hopeless_and_what_lasts_is():
+def test_a_brief_peak_is_not_hopeless_but_a_lasting_load_is():
     for share, verdict in ((0.005, TRY_IT), (0.02, HOPELESS)):
         torque = np.full(1000, 0.01)
         torque[: int(1000 * share)] = 10.0  # 20 V of 24 at 0.01 N*m would be 0.2; here 200 V
-        asked = dataclasses.replace(
-            recorded(1e-2 * np.arange(1000), torque, np.full(1000, 1.0)), exact=False
+        demand = dataclasses.replace(
+            demand_from_arrays(1e-2 * np.arange(1000), torque, np.full(1000, 1.0)), exact=False
         )
-        assert feasibility(drive(12.0, rotor_inertia=LIGHT), asked, COOL).verdict == verdict
+        assert feasibility(drive(12.0, rotor_inertia=LIGHT), demand, COOL).verdict == verdict
 
 
-def test_a_servo_that_gets_there_later_is_never_hopeless():
-    asked = swinging(10.0, 100.0)
-    assert feasibility(drive(12.0, rotor_inertia=LIGHT), asked, COOL).verdict == HOPELESS
+def test_a_slower_servo_is_never_hopeless():
+    demand = swinging(10.0, 100.0)
+    assert feasibility(drive(12.0, rotor_inertia=LIGHT), demand, COOL).verdict == HOPELESS
     slower = feasibility(
-        drive(12.0, rotor_inertia=LIGHT), dataclasses.replace(asked, servo=True), COOL
+        drive(12.0, rotor_inertia=LIGHT), dataclasses.replace(demand, servo=True), COOL
     )
     assert slower.verdict == TRY_IT
     assert (
         "its servo asks for less where the motor is slower: evaluate the run on this motor"
-        in slower.why
+        in slower.reason
     )
 
 
-def test_a_run_knows_which_motors_are_behind_a_servo(tmp_path, monkeypatch):
+def test_a_run_reports_which_motors_have_a_servo(tmp_path, monkeypatch):
     """The arm has a position servo and a plain motor; the run's policy acts at random."""
     (tmp_path / "arm.xml").write_text(ARM.replace('gear="5"', 'gear="5" ctrlrange="-1 1"'))
     gymnasium.register(

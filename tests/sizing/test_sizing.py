@@ -1,4 +1,4 @@
-"""Whether a motor can do a task: formulas against closed forms, and predictions against simulations."""
+"""Feasibility of tasks: formulas against closed forms, and predictions against simulations."""
 
 import dataclasses
 import json
@@ -21,17 +21,17 @@ from codrl_mj.sizing import (
     TRY_IT,
     best_ratio,
     choose,
+    demand_from_arrays,
     demand_of,
     feasibility,
     find_drive,
-    least_gain,
-    least_pumped,
-    least_voltage,
+    min_energy_gain,
+    min_pumped_energy,
+    min_supply_voltage,
     operation,
-    recorded,
 )
-from codrl_mj.sizing.abilities import most_power
-from codrl_mj.sizing.scripted import Scripted, state_observed
+from codrl_mj.sizing.abilities import max_power
+from codrl_mj.sizing.scripted import Scripted, observe_state
 from codrl_mj.tasks import TASKS
 from tests.matrix import matrix_params
 
@@ -54,11 +54,11 @@ def drive(motor=PAPER, voltage=24.0, **loop):
 
 
 def steady(torque, speed, count=11):
-    return recorded(0.1 * np.arange(count), np.full(count, torque), np.full(count, speed))
+    return demand_from_arrays(0.1 * np.arange(count), np.full(count, torque), np.full(count, speed))
 
 
-def bounds(found):
-    return {bound.name: bound for bound in found.bounds}
+def bounds(judgment):
+    return {bound.name: bound for bound in judgment.bounds}
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def pendulum():
 
 
 def from_hanging(actuator, steps=400):
-    """States of the scripted swing-up on an actuator, from almost hanging, shape (steps + 1, 2)."""
+    """Return the states (steps + 1, 2) of the scripted swing-up from almost hanging."""
     env, policy = (
         EnvConfig("pendulum", actuator, max_episode_steps=steps).make(),
         Scripted(TASKS["pendulum"]),
@@ -88,33 +88,37 @@ def swings_up(actuator):
 # formulas
 
 
-def test_a_steady_load_takes_what_the_motor_equation_says():
+def test_a_steady_load_follows_the_motor_equation():
     motor = dataclasses.replace(
         MOTOR, gear_ratio=20.0, coulomb_friction=1e-3, viscous_friction=1e-6
     )
-    asked = operation(steady(1.5, 8.0), drive(motor))
+    required = operation(steady(1.5, 8.0), drive(motor))
     torque = 1.5 / 20.0 + 1e-3 + 1e-6 * 160.0
-    assert asked.torque == pytest.approx(torque)
-    assert asked.voltage == pytest.approx(2.0 * torque / 0.05 + 0.04 * 160.0)
-    assert asked.rms_current == pytest.approx(torque / 0.05)
-    assert asked.copper_loss == pytest.approx(1.1 * 2.0 * (torque / 0.05) ** 2)
-    assert asked.energy_drawn == pytest.approx(1.1 * asked.voltage[0] * torque / 0.05)
+    assert required.torque == pytest.approx(torque)
+    assert required.voltage == pytest.approx(2.0 * torque / 0.05 + 0.04 * 160.0)
+    assert required.rms_current == pytest.approx(torque / 0.05)
+    assert required.copper_loss == pytest.approx(1.1 * 2.0 * (torque / 0.05) ** 2)
+    assert required.energy_drawn == pytest.approx(1.1 * required.voltage[0] * torque / 0.05)
 
 
-def test_rotor_and_gear_are_part_of_the_load():
+def test_rotor_and_gear_add_to_the_load():
     time = np.linspace(0.0, 2.0, 2001)
     motor = dataclasses.replace(MOTOR, gear_ratio=30.0, gear_efficiency=0.8)
-    asked = operation(recorded(time, np.zeros_like(time), 5.0 * np.sin(4.0 * time)), drive(motor))
+    required = operation(
+        demand_from_arrays(time, np.zeros_like(time), 5.0 * np.sin(4.0 * time)), drive(motor)
+    )
     driving = np.cos(4.0 * time) * np.sin(4.0 * time) > 0.0
     expected = 1e-5 * 30.0 * 20.0 * np.cos(4.0 * time) / np.where(driving, 0.8, 1.0)
-    assert asked.torque[1:-1] == pytest.approx(expected[1:-1], abs=1e-7)
+    assert required.torque[1:-1] == pytest.approx(expected[1:-1], abs=1e-7)
 
 
-def test_a_change_of_the_torque_takes_l_di_dt_within_its_step():
-    """Steps of 1.5 N*m in 0.1 s at 8 rad/s: up it takes more voltage, down less than the back-EMF, or the reverse."""
+def test_a_torque_step_adds_l_di_dt_to_the_voltage():
+    """Torque steps of 1.5 N*m in 0.1 s at 8 rad/s: a rise needs more voltage, a fall less."""
     slow = dataclasses.replace(MOTOR, inductance=0.05, rotor_inertia=0.0)
     torque = np.array([0.0, 1.5, 1.5, 0.0])
-    asked = operation(recorded(0.1 * np.arange(4), torque, np.full(4, 8.0)), drive(slow))
+    required = operation(
+        demand_from_arrays(0.1 * np.arange(4), torque, np.full(4, 8.0)), drive(slow)
+    )
     current, rise, back_emf = 1.5 / 0.05, 0.05 * 30.0 / 0.1, 0.04 * 8.0
     expected = [
         back_emf,
@@ -122,10 +126,10 @@ def test_a_change_of_the_torque_takes_l_di_dt_within_its_step():
         2.0 * current + back_emf,
         rise - back_emf,
     ]
-    assert asked.voltage == pytest.approx(expected)
+    assert required.voltage == pytest.approx(expected)
 
 
-def test_the_best_gear_takes_the_least_voltage():
+def test_the_best_gear_minimizes_the_voltage():
     ratio = best_ratio(1.5, 8.0, MOTOR)
     assert ratio == pytest.approx(math.sqrt(2.0 * 1.5 / (0.05 * 0.04 * 8.0)))
     light = dataclasses.replace(MOTOR, rotor_inertia=0.0)
@@ -142,7 +146,7 @@ def test_the_best_gear_takes_the_least_voltage():
     assert chosen.ratio == pytest.approx(float(best_ratio(1.5, 8.0, motor)), rel=0.02)
 
 
-def test_power_is_a_quarter_of_what_a_blocked_motor_burns():
+def test_the_largest_power_is_a_quarter_of_the_stall_losses():
     bound = bounds(feasibility(drive(voltage=8.0), steady(2.0, 8.0)))["power"]
     assert (bound.needed, bound.available) == pytest.approx((16.0, 16.0))
     weaker = bounds(feasibility(drive(voltage=7.9), steady(2.0, 8.0)))["power"]
@@ -154,23 +158,24 @@ def test_power_is_a_quarter_of_what_a_blocked_motor_burns():
 
 
 def test_stall_and_heat():
-    found = bounds(
+    judgment = bounds(
         feasibility(drive(voltage=24.0, max_current=3.0), steady(2.0, 1.0), continuous_current=1.9)
     )
-    assert found["stall"].available == pytest.approx(3.0)
-    assert (found["heat"].needed, found["heat"].verdict) == (pytest.approx(2.0), TRY_IT)
+    assert judgment["stall"].available == pytest.approx(3.0)
+    assert (judgment["heat"].needed, judgment["heat"].verdict) == (pytest.approx(2.0), TRY_IT)
     stiff = dataclasses.replace(PAPER, coulomb_friction=30.0)
     assert bounds(feasibility(drive(stiff), dataclasses.replace(steady(2.0, 1.0), exact=False)))[
         "stall"
     ].verdict == (SURELY_NOT)
 
 
-def test_what_is_recorded_is_to_be_delivered_and_what_a_policy_asks_may_be_asked_otherwise():
-    asked = steady(2.0, 8.0)
-    assert feasibility(drive(voltage=10.0), asked, COOL).verdict == SURELY
-    assert feasibility(drive(voltage=9.9), asked).verdict == SURELY_NOT
+def test_recordings_are_exact_demands_and_tasks_are_not():
+    required = steady(2.0, 8.0)
+    assert feasibility(drive(voltage=10.0), required, COOL).verdict == SURELY
+    assert feasibility(drive(voltage=9.9), required).verdict == SURELY_NOT
     assert (
-        feasibility(drive(voltage=9.9), dataclasses.replace(asked, exact=False)).verdict == TRY_IT
+        feasibility(drive(voltage=9.9), dataclasses.replace(required, exact=False)).verdict
+        == TRY_IT
     )
 
 
@@ -186,15 +191,15 @@ def test_what_is_recorded_is_to_be_delivered_and_what_a_policy_asks_may_be_asked
         (24.0, {}, 0.62, HOPELESS),  # of 2 A rms: ten times the heat
     ],
 )
-def test_what_is_short_by_ten_is_hopeless(voltage, loop, continuous, verdict):
-    asked = dataclasses.replace(steady(2.0, 1.0), exact=False)
-    assert feasibility(drive(voltage=voltage, **loop), asked, continuous).verdict == verdict
+def test_a_shortage_by_a_factor_of_ten_is_hopeless(voltage, loop, continuous, verdict):
+    required = dataclasses.replace(steady(2.0, 1.0), exact=False)
+    assert feasibility(drive(voltage=voltage, **loop), required, continuous).verdict == verdict
 
 
 # predictions
 
 
-def test_the_scripted_swing_up_reaches_upright_and_says_so(pendulum):
+def test_the_scripted_swing_up_reaches_and_reports_upright(pendulum):
     assert (
         pendulum.source == "scripted swing-up and hold of pendulum, 10 of 10 episodes at the goal"
     )
@@ -202,11 +207,13 @@ def test_the_scripted_swing_up_reaches_upright_and_says_so(pendulum):
     assert np.abs(pendulum.torque).max() == 2.0
 
 
-def test_the_supply_that_a_swing_up_takes_is_predicted_and_found(pendulum):
-    """5.17 V at least for any controller, 5.59 V by the energy of swings; the slower the winding, the more."""
-    least = least_voltage(pendulum.swing, drive(), least_gain)
-    assert least == pytest.approx(5.17, abs=0.02)
-    assert least_voltage(pendulum.swing, drive(), least_pumped) == pytest.approx(5.59, abs=0.02)
+def test_the_predicted_supply_of_a_swing_up_agrees_with_simulation(pendulum):
+    """Any controller needs 5.17 V, and energy pumping 5.59 V; a slower winding needs more."""
+    min_voltage = min_supply_voltage(pendulum.swing, drive(), min_energy_gain)
+    assert min_voltage == pytest.approx(5.17, abs=0.02)
+    assert min_supply_voltage(pendulum.swing, drive(), min_pumped_energy) == pytest.approx(
+        5.59, abs=0.02
+    )
     assert feasibility(drive(voltage=5.1), pendulum).verdict == SURELY_NOT
     assert feasibility(drive(voltage=5.5), pendulum).verdict == TRY_IT
     slow = dataclasses.replace(PAPER, inductance=0.1)
@@ -216,125 +223,129 @@ def test_the_supply_that_a_swing_up_takes_is_predicted_and_found(pendulum):
     assert swings_up(drive(slow, 6.0))
 
 
-def test_a_motor_that_one_can_buy_swings_up_a_little_above_the_supply_that_is_predicted(pendulum):
+def test_a_catalogue_motor_swings_up_slightly_above_the_predicted_supply(pendulum):
     motor = find_drive("faulhaber-1331-006", 160.0)
-    least = least_voltage(pendulum.swing, motor, least_gain)
-    assert not swings_up(dataclasses.replace(motor, supply=Supply(0.97 * least)))
-    assert swings_up(dataclasses.replace(motor, supply=Supply(1.1 * least)))
+    min_voltage = min_supply_voltage(pendulum.swing, motor, min_energy_gain)
+    assert not swings_up(dataclasses.replace(motor, supply=Supply(0.97 * min_voltage)))
+    assert swings_up(dataclasses.replace(motor, supply=Supply(1.1 * min_voltage)))
 
 
-def test_behind_a_supply_that_sags_a_motor_can_what_one_of_more_resistance_can(pendulum):
-    """Below the no-load speed: power, stall, energy of a swing. What supply it takes is found."""
+def test_a_sagging_supply_acts_like_additional_resistance(pendulum):
+    """Compare power, stall and swings below the no-load speed, and the required supply."""
     sagging = Drive(PAPER, SampledLoop(), Supply(7.5, 0.5))
     stiff = drive(dataclasses.replace(PAPER, resistance=1.5), 7.5)
-    ours, theirs = (bounds(feasibility(one, pendulum)) for one in (sagging, stiff))
+    ours, theirs = (bounds(feasibility(drive_, pendulum)) for drive_ in (sagging, stiff))
     for name in ("voltage", "stall", "power", "pumping", "swing"):
         assert ours[name].available == pytest.approx(theirs[name].available, rel=1e-12)
         assert ours[name].needed == pytest.approx(theirs[name].needed, rel=1e-12)
-    least = least_voltage(pendulum.swing, sagging, least_gain)
-    assert not swings_up(dataclasses.replace(sagging, supply=Supply(0.97 * least, 0.5)))
-    assert swings_up(dataclasses.replace(sagging, supply=Supply(1.1 * least, 0.5)))
+    min_voltage = min_supply_voltage(pendulum.swing, sagging, min_energy_gain)
+    assert not swings_up(dataclasses.replace(sagging, supply=Supply(0.97 * min_voltage, 0.5)))
+    assert swings_up(dataclasses.replace(sagging, supply=Supply(1.1 * min_voltage, 0.5)))
 
 
-def test_friction_and_damping_make_a_swing_up_harder(pendulum):
-    light = least_gain(pendulum.swing, drive(voltage=5.5))
+def test_friction_and_damping_raise_the_supply_of_a_swing_up(pendulum):
+    light = min_energy_gain(pendulum.swing, drive(voltage=5.5))
     rough = dataclasses.replace(PAPER, coulomb_friction=0.1)
-    assert least_gain(pendulum.swing, drive(rough, 5.5)) < light
-    assert least_gain(pendulum.swing._replace(damping=0.05), drive(voltage=5.5)) < light
-    assert least_pumped(pendulum.swing._replace(largest=6.0), drive()) == math.inf
+    assert min_energy_gain(pendulum.swing, drive(rough, 5.5)) < light
+    assert min_energy_gain(pendulum.swing._replace(damping=0.05), drive(voltage=5.5)) < light
+    assert min_pumped_energy(pendulum.swing._replace(largest=6.0), drive()) == math.inf
 
 
-def test_what_is_surely_enough_changes_nothing(pendulum):
-    """10 V for 2 N*m at 8 rad/s: the run on the ideal actuator, but for what a winding of L/R = 0.1 ms delays."""
+def test_a_surely_sufficient_motor_does_not_change_the_run(pendulum):
+    """At 10 V the run equals the ideal one, up to the delay of L/R = 0.1 ms."""
     quick = drive(dataclasses.replace(PAPER, inductance=1e-4), 10.0)
     assert operation(pendulum, quick).voltage.max() <= 10.0
     assert feasibility(quick, pendulum, COOL).verdict == SURELY
     assert np.abs(from_hanging(quick) - from_hanging(Ideal())).max() < 0.005
 
 
-def test_the_first_choice_delivers_what_was_asked(pendulum):
+def test_the_first_choice_delivers_the_demand(pendulum):
     first = choose(pendulum)[0]
     assert first.feasibility.verdict == SURELY
-    asked, family, state, delivered = (
+    required, family, state, delivered = (
         first.feasibility.operation,
         type(first.drive),
         Drive.State(*[0.0] * len(Drive.State._fields)),
         [],
     )
-    parameters = parameters_type(family)(*first.drive.numbers)
-    for torque, speed in zip(asked.torque, asked.speed, strict=True):
-        state, made, _ = Drive.advance(
+    parameters = parameters_type(family)(*first.drive.parameter_values)
+    for torque, speed in zip(required.torque, required.speed, strict=True):
+        state, output, _ = Drive.advance(
             parameters, 0.05, state, Inputs(torque, 0.0, speed, 0.0, 0.0)
         )
-        delivered.append(made)
-    error = np.array(delivered) - asked.torque
-    assert np.abs(error).max() < 0.02 * np.abs(asked.torque).max()
+        delivered.append(output)
+    error = np.array(delivered) - required.torque
+    assert np.abs(error).max() < 0.02 * np.abs(required.torque).max()
 
 
-def test_the_smallest_motor_that_does_it_with_a_margin_comes_first_and_the_others_say_what_they_lack(
+def test_the_smallest_suitable_motor_comes_first_and_the_others_have_reasons(
     pendulum,
 ):
     choices = choose(pendulum)
-    good = [one for one in choices if not one.lacks]
+    good = [choice for choice in choices if not choice.rejection_reason]
     assert choices[: len(good)] == good
-    assert [one.power for one in good] == sorted(one.power for one in good)
-    assert min(one.feasibility.margin for one in good) >= 0.2
-    assert max(one.feasibility.operation.own_share for one in good) <= 0.5
-    assert {one.feasibility.verdict for one in good} == {SURELY}
-    assert not any("continuous current" in one.unknown for one in good)
-    others = {one.name: one for one in choices[len(good) :]}
-    assert "no gear helps: raise the supply to 15.01 V" in others["dynamixel-mx-64"].lacks
+    assert [choice.power for choice in good] == sorted(choice.power for choice in good)
+    assert min(choice.feasibility.margin for choice in good) >= 0.2
+    assert max(choice.feasibility.operation.own_share for choice in good) <= 0.5
+    assert {choice.feasibility.verdict for choice in good} == {SURELY}
+    assert not any("continuous current" in choice.unknown for choice in good)
+    others = {choice.name: choice for choice in choices[len(good) :]}
+    assert (
+        "no gear helps: raise the supply to 15.01 V" in others["dynamixel-mx-64"].rejection_reason
+    )
     assert others["dynamixel-mx-64"].ratio == 200.0
     assert "motor.rotor_inertia = 0" in others["pololu-37d-30"].drive.assumed
     assert others["kraken-x60"].feasibility.verdict == DEPENDS
-    assert "heat: its continuous current is not known" in others["kraken-x60"].lacks
-    assert "rotor: its inertia is not known" in others["kraken-x60"].lacks
-    assert "with a margin of 9%, must be 20%" in others["quanser-qube-servo-3"].lacks
-    wide = [one.name for one in choose(pendulum, least_margin=0.6) if not one.lacks]
-    assert wide == [one.name for one in good if one.feasibility.margin >= 0.6]
+    assert "heat: its continuous current is not known" in others["kraken-x60"].rejection_reason
+    assert "rotor: its inertia is not known" in others["kraken-x60"].rejection_reason
+    assert "with a margin of 9%, must be 20%" in others["quanser-qube-servo-3"].rejection_reason
+    wide = [
+        choice.name for choice in choose(pendulum, min_margin=0.6) if not choice.rejection_reason
+    ]
+    assert wide == [choice.name for choice in good if choice.feasibility.margin >= 0.6]
 
 
-def test_the_power_of_a_motor_is_what_it_makes_at_its_best():
-    """The torque-speed line i*(V - R*i)*kT/kE, searched; with a largest current only as far as that."""
-    for most in (math.inf, 2.0):
-        one = drive(MOTOR, max_current=most)
-        currents = np.linspace(0.0, min(most, 12.0), 100_001)
-        assert most_power(one) == pytest.approx(
+def test_max_power_agrees_with_a_search():
+    """Maximize i*(V - R*i)*kT/kE by search, also with a largest current."""
+    for max_current in (math.inf, 2.0):
+        drive_ = drive(MOTOR, max_current=max_current)
+        currents = np.linspace(0.0, min(max_current, 12.0), 100_001)
+        assert max_power(drive_) == pytest.approx(
             np.max(currents * (24.0 - 2.0 * currents) * 0.05 / 0.04), rel=1e-8
         )
 
 
-def test_a_motor_that_moves_itself_is_none_for_a_policy_and_any_for_a_recording():
+def test_a_heavy_rotor_is_rejected_for_tasks_but_not_for_recordings():
     """A rotor whose reflected inertia takes twice the load's torque."""
     time = np.linspace(0.0, 2.0, 2001)
-    swinging = recorded(time, 0.02 * np.cos(4.0 * time), 10.0 * np.sin(4.0 * time))
+    swinging = demand_from_arrays(time, 0.02 * np.cos(4.0 * time), 10.0 * np.sin(4.0 * time))
     name = ["cubemars-ak80-6"]  # has a gear of its own: 6.07e-5 * 36 * 40 = 0.087 N*m
     assert (
         "needs 437.2 %, has 50 %"
-        in choose(dataclasses.replace(swinging, exact=False), name)[0].lacks
+        in choose(dataclasses.replace(swinging, exact=False), name)[0].rejection_reason
     )
-    assert choose(swinging, name)[0].lacks == ""
+    assert choose(swinging, name)[0].rejection_reason == ""
 
 
-def test_the_gear_leaves_a_policy_its_load_and_a_recording_the_largest_margin():
+def test_the_gear_limits_the_rotor_share_for_tasks_and_maximizes_the_margin_of_recordings():
     time = np.linspace(0.0, 2.0, 2001)
-    recording = recorded(time, 0.1 * np.cos(4.0 * time), 10.0 * np.sin(4.0 * time))
+    recording = demand_from_arrays(time, 0.1 * np.cos(4.0 * time), 10.0 * np.sin(4.0 * time))
     free, bound = (
-        choose(one, ["maxon-ec45-flat-50w"])[0].feasibility
-        for one in (recording, dataclasses.replace(recording, exact=False))
+        choose(drive_, ["maxon-ec45-flat-50w"])[0].feasibility
+        for drive_ in (recording, dataclasses.replace(recording, exact=False))
     )
     assert bound.operation.own_share < 0.5 < 1.0 < free.operation.own_share
     assert 0.5 < bound.margin < free.margin
 
 
 def arrivals(task, actuator, episodes=5):
-    """How many scripted episodes of a task end at the goal."""
+    """Return the number of scripted episodes of a task that end at the goal."""
     env = EnvConfig(task, actuator, inner_steps=TASKS[task].motor_inner_steps)
     policy = Scripted(TASKS[task])
-    ran = run_episodes(policy, lambda: state_observed(env.make()), episodes, 0)
+    ran = run_episodes(policy, lambda: observe_state(env.make()), episodes, 0)
     return sum(
-        not one.terminated if task == "cartpole" else bool(TASKS[task].goal(one.state[-1]))
-        for one in ran
+        not episode.terminated if task == "cartpole" else bool(TASKS[task].goal(episode.state[-1]))
+        for episode in ran
     )
 
 
@@ -342,11 +353,11 @@ def arrivals(task, actuator, episodes=5):
     "task",
     matrix_params(["pendulum"], ["pendulum", "cartpole", "acrobot", "mountain_car_continuous"]),
 )
-def test_the_first_choice_does_the_task_in_the_engine(task):
+def test_the_first_choice_succeeds_in_simulation(task):
     assert arrivals(task, choose(demand_of(task))[0].drive) == 5
 
 
-def test_a_motor_that_lacks_voltage_stall_torque_and_power_does_not(pendulum):
+def test_an_insufficient_motor_fails_in_simulation(pendulum):
     (choice,) = choose(pendulum, ["quanser-srv02"])
     assert {bound.name for bound in choice.feasibility.bounds if not bound.holds} >= {
         "voltage",
@@ -377,21 +388,21 @@ def test_on_a_slide_a_geared_motor_gets_a_wheel():
         (lambda: find_drive("frc-cim", voltage=-1.0), "voltage = -1"),
         (lambda: find_drive("lag"), "no motor behind a drive"),
         (
-            lambda: choose(steady(1.0, 1.0), ["frc-cim"], least_margin=1.0),
-            r"least_margin = 1: must be >= 0 and < 1",
+            lambda: choose(steady(1.0, 1.0), ["frc-cim"], min_margin=1.0),
+            r"min_margin = 1: must be >= 0 and < 1",
         ),
-        (lambda: recorded([0.0, 1.0], [1.0], [1.0, 1.0]), "torque: shape"),
-        (lambda: recorded([0.0, 0.0], [1.0, 1.0], [1.0, 1.0]), r"time\[1\] = 0 s"),
-        (lambda: recorded([0.0, 1.0], [1.0, math.nan], [1.0, 1.0]), r"torque\[1\] = nan"),
+        (lambda: demand_from_arrays([0.0, 1.0], [1.0], [1.0, 1.0]), "torque: shape"),
+        (lambda: demand_from_arrays([0.0, 0.0], [1.0, 1.0], [1.0, 1.0]), r"time\[1\] = 0 s"),
+        (lambda: demand_from_arrays([0.0, 1.0], [1.0, math.nan], [1.0, 1.0]), r"torque\[1\] = nan"),
         (lambda: feasibility(Ideal(), steady(1.0, 1.0)), "must be a codrl_mj.actuators.Drive"),
     ],
 )
-def test_bad_input_is_refused_with_a_remedy(call, match):
+def test_raises_with_a_remedy_if_the_input_is_invalid(call, match):
     with pytest.raises(ValueError, match=match):
         call()
 
 
-def test_a_file_that_is_no_recording_is_refused(tmp_path):
+def test_raises_if_the_file_is_not_a_recording(tmp_path):
     np.savez(tmp_path / "half.npz", time=np.arange(3.0), torque=np.ones(3))
     with pytest.raises(ValueError, match=r"half.npz: no recording .* speed"):
         demand_of(tmp_path / "half.npz")
@@ -423,7 +434,7 @@ def test_the_command_judges_a_recording_and_draws_it(tmp_path, capsys):
     assert "gear_ratio = 0" in capsys.readouterr().err
 
 
-def test_the_command_chooses_and_says_what_is_wrong_with_the_rest(tmp_path, capsys):
+def test_the_command_chooses_and_explains_rejections(tmp_path, capsys):
     assert main(["motor", "choose", "pendulum", "--top", "2", "--out", str(tmp_path)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "smallest suitable motor with a margin of 20% first" in printed
@@ -431,9 +442,9 @@ def test_the_command_chooses_and_says_what_is_wrong_with_the_rest(tmp_path, caps
     assert len(list(tmp_path.glob("*.png"))) == 2
 
 
-def test_on_a_slide_gears_have_a_unit_and_hopeless_is_a_failure(monkeypatch, capsys):
-    asked = dataclasses.replace(steady(10.0, 1.0), exact=False, linear=True)
-    monkeypatch.setattr("codrl_mj.sizing.demand_of", lambda *_, **__: asked)
+def test_gears_on_a_slide_have_a_unit_and_hopeless_sets_the_exit_status(monkeypatch, capsys):
+    demand = dataclasses.replace(steady(10.0, 1.0), exact=False, linear=True)
+    monkeypatch.setattr("codrl_mj.sizing.demand_of", lambda *_, **__: demand)
     assert main(["motor", "feasible", "rev-neo", "cartpole"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "rev-neo, gear 1 rad/m, 12 V" in printed
@@ -443,7 +454,7 @@ def test_on_a_slide_gears_have_a_unit_and_hopeless_is_a_failure(monkeypatch, cap
     assert capsys.readouterr().out.splitlines()[-1] == "hopeless"
 
 
-def test_ones_own_motors_are_ranked_among_themselves(tmp_path, capsys, monkeypatch):
+def test_custom_motors_are_ranked_alone(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sheet = '[datasheet]\nkv = "340 rpm/V"\nresistance = "64 mohm"\ninductance = "30 uH"\n'
     Path("a.toml").write_text(sheet)
@@ -462,7 +473,7 @@ def test_ones_own_motors_are_ranked_among_themselves(tmp_path, capsys, monkeypat
             "supply.voltage = 24 V, controller.max_current = inf, motor.rotor_inertia = 0"
             in printed
         )
-    for words, said in (
+    for words, text in (
         (["a.toml"], "got no task: name exactly one task"),
         (["pendulum", "cartpole"], "got pendulum and cartpole: name exactly one"),
         (["c.toml", "joint.npz"], "there is no such file"),
@@ -470,20 +481,20 @@ def test_ones_own_motors_are_ranked_among_themselves(tmp_path, capsys, monkeypat
         (["rev-nao", "joint.npz"], "did you mean 'rev-neo'"),
     ):
         assert main(["motor", "choose", *words]) == 2
-        assert said in capsys.readouterr().err
+        assert text in capsys.readouterr().err
     Path("other").mkdir()
     Path("other/a.toml").write_text(sheet)
     assert (
         main(["motor", "choose", "a.toml", "other/a.toml", "joint.npz", "--out", "found"]) == 1
-    )  # for how long is not known
+    )  # The duration is unknown.
     assert len(list(Path("found").glob("*-a.png"))) == 2
 
 
-def test_runs_count_where_they_were_trained_on_the_ideal_actuator(tmp_path, capsys):
-    there, run = Path(__file__).parents[1] / "fixtures" / "runs" / "cartpole", tmp_path / "run"
-    assert main(["motor", "choose", str(there)]) == 2
+def test_only_runs_trained_on_the_ideal_actuator_are_accepted(tmp_path, capsys):
+    folder, run = Path(__file__).parents[1] / "fixtures" / "runs" / "cartpole", tmp_path / "run"
+    assert main(["motor", "choose", str(folder)]) == 2
     assert "was trained on current_loop: must be ideal" in capsys.readouterr().err
-    shutil.copytree(there, run)
+    shutil.copytree(folder, run)
     config = json.loads((run / "config.json").read_text())
     config.pop("sha256")
     config["train"]["env"]["actuator"] = None

@@ -1,4 +1,4 @@
-"""Run folders of studies that were never run: scores that a formula gives, where the study looks for them."""
+"""Run folders with pretended results: scores from a formula, in the files that a study reads."""
 
 import json
 
@@ -11,9 +11,9 @@ def pretend(grid, score, leaving_out=()):
     """Write finished runs and tests.
 
     Args:
-        grid: of the study.
-        score: (trial, seed) -> mean return.
-        leaving_out: (arm, seed) of trainings that are not to be there.
+        grid: grid of the study.
+        score: function (trial, seed) -> mean return.
+        leaving_out: (arm, seed) of trainings that are left out.
     """
     folders, tests = grid.folders, grid.deployments
     for cell, config in grid.cells.items():
@@ -35,7 +35,7 @@ def pretend(grid, score, leaving_out=()):
 
 
 def _episodes(steps):
-    """Twenty equally long ones, which return 1, 2, ... 20."""
+    """Return twenty training episodes of equal length with returns 1, 2, ... 20."""
     rows = [
         f"{number},{round(number * steps / 20)},{number},{steps // 20}" for number in range(1, 21)
     ]
@@ -43,7 +43,7 @@ def _episodes(steps):
 
 
 def evaluation(mean_return, episodes):
-    """An evaluation whose every measure but the return is 1, or unknown."""
+    """Return an evaluation in which every measure but the return is 1 or None."""
     values = dict.fromkeys(MEASURES, 1.0) | {"tracking_percent": None}
     values |= {name: {"mean": 0.5, "low": 0.25, "high": 0.75} for name in INTERVALS}
     return values | {

@@ -1,4 +1,4 @@
-"""What is advised about an actuator: the bench against closed forms, and verdicts on results that a formula gives."""
+"""Advice on an actuator: the bench against closed forms, and verdicts on results from a formula."""
 
 import csv
 import dataclasses
@@ -20,22 +20,30 @@ from codrl_mj.study.advice import (
     IDEAL,
     LOOP,
     MEASURE,
-    RANDOMISE,
+    RANDOMIZE,
     THROUGH,
-    Prospect,
+    LossBounds,
     advise,
     decide,
-    measurement,
+    plan_measurement,
 )
-from codrl_mj.study.bench import delivered, doses, redesign
-from codrl_mj.study.doses import AXES, FLOORS, REAL, REFERENCE_SPEEDS, posed, supplied, timestep
+from codrl_mj.study.axes import (
+    AXES,
+    FLOORS,
+    REAL,
+    REFERENCE_SPEEDS,
+    drive_on_supply,
+    study_env,
+    timestep,
+)
+from codrl_mj.study.bench import measure_on_task, redesign_loop, severities
 from codrl_mj.study.evidence import Evidence, Outcome
 from codrl_mj.tasks import find_task, named_actuator
 from codrl_mj.training import TrainConfig
 from tests.matrix import matrix_params
 from tests.study.pretended import pretend
 
-OWN_STEPS = {"supply": 1.0 / (2.0 * math.pi * 0.0555 * 20.0), "noise": 1.0}
+LOOP_STEPS = {"supply": 1.0 / (2.0 * math.pi * 0.0555 * 20.0), "noise": 1.0}
 """Integration steps that the loops of the axes' own motors take: a bandwidth of 0.0555 of 20
 samples a step; and half of what is left in each step, 1/2 + 1/4 + ...
 """
@@ -43,31 +51,37 @@ samples a step; and half of what is left in each step, 1/2 + 1/4 + ...
 
 @pytest.mark.parametrize("task", matrix_params(["furuta"], REFERENCE_SPEEDS))
 @pytest.mark.parametrize("axis", ["lag", "weakness", "supply", "noise"])
-def test_the_bench_finds_every_dose_of_the_study_and_nothing_else(task, axis):
-    for dose in AXES[axis].doses:
-        found = doses(delivered(AXES[axis].at(task, dose).actuator, task), task)
+def test_the_bench_measures_every_severity_and_nothing_on_other_axes(task, axis):
+    for severity in AXES[axis].severities:
+        measured = severities(
+            measure_on_task(AXES[axis].make_env(task, severity).actuator, task), task
+        )
         finest = timestep(task) / find_task(task).step_duration  # policy steps
-        expected = dict.fromkeys(AXES, 0.0) | {axis: dose}
+        expected = dict.fromkeys(AXES, 0.0) | {axis: severity}
         if axis == "lag":
-            missing = math.exp(-20.0 / dose) if dose else 0.0  # after the horizon of 20 steps
-            assert found.pop("weakness") == pytest.approx(missing, abs=2e-3)
-            whole = (dose - 20.0 * missing / (1.0 - missing)) if dose else 0.0
-            assert found.pop("lag") == pytest.approx(
+            missing = (
+                math.exp(-20.0 / severity) if severity else 0.0
+            )  # Missing after the horizon of 20 steps.
+            assert measured.pop("weakness") == pytest.approx(missing, abs=2e-3)
+            whole = (severity - 20.0 * missing / (1.0 - missing)) if severity else 0.0
+            assert measured.pop("lag") == pytest.approx(
                 max(whole - finest / 2, 0.0), abs=0.1 * finest, rel=5e-3
             )
         else:
-            assert found.pop("lag") == pytest.approx(
-                OWN_STEPS.get(axis, 0.0) * finest, abs=0.1 * finest
+            assert measured.pop("lag") == pytest.approx(
+                LOOP_STEPS.get(axis, 0.0) * finest, abs=0.1 * finest
             )
-        for name, value in found.items():
+        for name, value in measured.items():
             assert value == pytest.approx(expected[name], abs=2e-3, rel=2e-3), name
 
 
-def test_a_delay_is_found_beside_a_lag():
+def test_the_bench_separates_delay_and_lag():
     step = find_task("pendulum").step_duration
-    found = doses(delivered(Lag(step, delay=0.6 * step), "pendulum"), "pendulum")
-    assert found["delay"] == pytest.approx(0.6)
-    assert found["lag"] == pytest.approx(0.95, abs=0.01)  # half an integration step less
+    measured = severities(measure_on_task(Lag(step, delay=0.6 * step), "pendulum"), "pendulum")
+    assert measured["delay"] == pytest.approx(0.6)
+    assert measured["lag"] == pytest.approx(
+        0.95, abs=0.01
+    )  # Half an integration step is subtracted.
 
 
 @pytest.mark.parametrize("task", ["pendulum", "mountain_car"])
@@ -80,35 +94,39 @@ def test_a_delay_is_found_beside_a_lag():
         ({"coulomb_friction": 0.02, "viscous_friction": 1e-3}, lambda speed: 0.02 + 1e-3 * speed),
     ],
 )
-def test_friction_is_the_gearmotor_s_at_the_output(task, kinds, expected):
-    drive = supplied(task, 100.0)
+def test_the_measured_friction_is_that_of_the_gearmotor_at_its_output(task, kinds, expected):
+    drive = drive_on_supply(task, 100.0)
     rubbed = dataclasses.replace(drive.motor, arm_radius=0.1, rotor_inertia=0.0, **kinds)
-    found = doses(delivered(dataclasses.replace(drive, motor=rubbed), task), task)["friction"]
+    measured = severities(measure_on_task(dataclasses.replace(drive, motor=rubbed), task), task)[
+        "friction"
+    ]
     at_the_rotor = expected(REFERENCE_SPEEDS[task] / 0.1)
-    assert found == pytest.approx(at_the_rotor / 0.1 / find_task(task).max_force, rel=1e-3)
+    assert measured == pytest.approx(at_the_rotor / 0.1 / find_task(task).max_force, rel=1e-3)
 
 
-def test_a_current_limit_is_weakness():
-    drive = supplied("pendulum", 100.0)
+def test_a_current_limit_counts_as_weakness():
+    drive = drive_on_supply("pendulum", 100.0)
     limited = dataclasses.replace(drive.controller, max_current=0.25 * drive.controller.max_current)
-    found = doses(delivered(dataclasses.replace(drive, controller=limited), "pendulum"), "pendulum")
-    assert found["weakness"] == pytest.approx(0.75, abs=1e-3)
-    assert found["supply"] == pytest.approx(0.0, abs=1e-3)
+    measured = severities(
+        measure_on_task(dataclasses.replace(drive, controller=limited), "pendulum"), "pendulum"
+    )
+    assert measured["weakness"] == pytest.approx(0.75, abs=1e-3)
+    assert measured["supply"] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_what_creeps_to_its_end_counts_as_missing():
-    """A PI loop that is at kp/(kp + R) with (L/R)/(1 + kp/R), and at the rest with (1 + kp)/ki."""
+def test_slowly_creeping_force_counts_as_missing():
+    """A PI loop reaches kp/(kp + R) with (L/R)/(1 + kp/R), and the rest with (1 + kp)/ki."""
     step, dt = find_task("pendulum").step_duration, timestep("pendulum")
     loop = CurrentLoop(kp=1.0, ki=2.0 / (1000 * step), max_voltage=1e3)
-    found = delivered(DCMotorActuator(Motor(1.0, 10 * dt, 1.0, 1.0), loop), "pendulum")
-    assert found.at_rest == pytest.approx(1.0 - 0.5 * math.exp(-0.02), abs=2e-3)
-    # of what is there in the 20th step: the quick half, by a fifth in each of ten integration
-    # steps, and what creeps
-    quick, creeps = (
+    delivery = measure_on_task(DCMotorActuator(Motor(1.0, 10 * dt, 1.0, 1.0), loop), "pendulum")
+    assert delivery.at_rest == pytest.approx(1.0 - 0.5 * math.exp(-0.02), abs=2e-3)
+    # Lag of the force that is present in the 20th step: the fast half decays by a fifth in each of
+    # ten integration steps, and the other half creeps.
+    quick, slow = (
         np.sum(0.8 ** np.arange(1, 100)) / 10.0,
         1000.0 * (1.0 - math.exp(-0.02)) - 20.0 * math.exp(-0.0195),
     )
-    assert found.lag == pytest.approx(0.5 * (quick + creeps) / found.at_rest, abs=0.005)
+    assert delivery.lag == pytest.approx(0.5 * (quick + slow) / delivery.at_rest, abs=0.005)
 
 
 # evidence
@@ -117,7 +135,7 @@ SEEDS = range(4)
 
 
 def results(lost, matched=0.02, generic=None):
-    """Rows of runs.csv: ideal-trained policies lose `lost(axis, dose)` on every task, and 0.001 more or less."""
+    """Yield rows of runs.csv in which ideal-trained policies lose `lost(axis, severity)`."""
 
     def row(task, trained, tested, loss):
         for seed in SEEDS:
@@ -133,18 +151,20 @@ def results(lost, matched=0.02, generic=None):
 
     for task in REFERENCE_SPEEDS:
         yield from row(task, "ideal", "ideal", 0.0)
-        for axis, known in AXES.items():
-            for dose in known.doses:
-                yield from row(task, "ideal", f"{axis} {dose:g}", lost(axis, dose))
-            if task in known.trained:
-                yield from row(task, axis, f"{axis} {known.trained[task]:g}", matched)
+        for axis, bounds_at in AXES.items():
+            for severity in bounds_at.severities:
+                yield from row(task, "ideal", f"{axis} {severity:g}", lost(axis, severity))
+            if task in bounds_at.training_severity:
+                yield from row(task, axis, f"{axis} {bounds_at.training_severity[task]:g}", matched)
                 if generic is not None:
-                    yield from row(task, "generic", f"{axis} {known.trained[task]:g}", generic)
+                    yield from row(
+                        task, "generic", f"{axis} {bounds_at.training_severity[task]:g}", generic
+                    )
 
 
-def proportional(axis, dose):
-    """Half of the span at the largest dose."""
-    return 0.5 * dose / AXES[axis].doses[-1]
+def proportional(axis, severity):
+    """Return half of the span at the largest severity, and proportionally less below it."""
+    return 0.5 * severity / AXES[axis].severities[-1]
 
 
 @pytest.fixture(scope="module")
@@ -158,9 +178,9 @@ def evidence(rows):
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_a_loss_is_interpolated_policy_by_policy_and_says_between_which_tests(axis):
-    """Policy 0 loses twice as much as policy 1, at every dose."""
-    tested = AXES[axis].doses
+def test_losses_are_interpolated_policy_by_policy_between_named_tests(axis):
+    """Policy 0 loses twice as much as policy 1 at every severity."""
+    tested = AXES[axis].severities
     rows = [
         {
             **row,
@@ -173,21 +193,21 @@ def test_a_loss_is_interpolated_policy_by_policy_and_says_between_which_tests(ax
         and row["seed"] in "01"
         and row["trained"] == "ideal"
     ]
-    home = [row for row in results(proportional) if row["tested"] == "ideal"]
+    baseline = [row for row in results(proportional) if row["tested"] == "ideal"]
     middle = (tested[1] + tested[2]) / 2
-    loss = Evidence([*home, *rows]).loss("acrobot", axis, middle)
-    extra = 0.0 if AXES[axis].own_motor else 0.001  # of the test without it
+    loss = Evidence([*baseline, *rows]).loss("acrobot", axis, middle)
+    extra = 0.0 if AXES[axis].motor_at_zero else 0.001  # of the test without it
     expected = [2 * proportional(axis, middle), proportional(axis, middle)]
     assert loss.outcome.lost == pytest.approx(
         np.array(expected) + np.array([extra, -extra]), abs=1e-12
     )
-    assert loss.between == tuple(sorted(f"{axis} {at:g}" for at in tested[1:3]))
+    assert loss.between == tuple(sorted(f"{axis} {severity:g}" for severity in tested[1:3]))
     assert not loss.beyond
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_of_more_than_was_tested_the_largest_loss_is_the_least(evidence, axis):
-    tested = AXES[axis].doses
+def test_beyond_the_tested_severities_the_largest_loss_is_a_lower_bound(evidence, axis):
+    tested = AXES[axis].severities
     beyond = evidence.loss("acrobot", axis, 2 * tested[-1])
     assert beyond.beyond
     assert beyond.outcome.loss.mean == pytest.approx(0.5)
@@ -195,7 +215,7 @@ def test_of_more_than_was_tested_the_largest_loss_is_the_least(evidence, axis):
     assert evidence.loss("acrobot", axis, 0.0).outcome.loss == (0.0, 0.0, 0.0)
 
 
-def test_an_outcome_s_interval_is_student_s_and_failures_are_counted():
+def test_an_outcome_has_student_s_interval_and_counts_failures():
     lost = np.array([0.0, 0.0, 0.02, 0.4])
     outcome = Outcome(lost, np.zeros(4))
     low, high = stats.t.interval(0.95, 3, np.mean(lost), stats.sem(lost))
@@ -203,128 +223,131 @@ def test_an_outcome_s_interval_is_student_s_and_failures_are_counted():
     assert outcome.failed == 0.25
     assert outcome.summary()["median"] == pytest.approx(0.01)
     assert outcome.summary()["worst"] == 0.4
-    assert not outcome.spared
-    assert not outcome.hurt
+    assert not outcome.is_negligible
+    assert not outcome.is_harmful
 
 
 @pytest.mark.parametrize(
-    ("lost", "missed", "spared", "hurt"),
+    ("lost", "missed", "is_negligible", "is_harmful"),
     [
         ([0.04] * 20, 0.0, True, False),
         ([0.06] * 20, 0.0, False, False),
         ([0.11] * 20, 0.0, False, True),
         ([0.0] * 18 + [0.3] * 2, 0.0, True, False),
-        ([0.0] * 17 + [0.2] * 3, 0.0, False, False),  # 0.03 on the mean, but three fail
-        ([0.0] * 20, 0.2, False, True),  # the score says nothing, success does
+        ([0.0] * 17 + [0.2] * 3, 0.0, False, False),  # The mean is 0.03, but three fail.
+        ([0.0] * 20, 0.2, False, True),  # Only success is lost.
     ],
 )
-def test_means_intervals_failures_and_success_decide(lost, missed, spared, hurt):
+def test_mean_interval_failures_and_success_classify_an_outcome(
+    lost, missed, is_negligible, is_harmful
+):
     outcome = Outcome(np.array(lost), np.full(20, missed))
-    assert (outcome.spared, outcome.hurt) == (spared, hurt)
+    assert (outcome.is_negligible, outcome.is_harmful) == (is_negligible, is_harmful)
 
 
 # verdicts
 
 
-def known(loss, policies=20):
+def bounds_at(loss, policies=20):
     outcome = Outcome(loss + 0.001 * (-1.0) ** np.arange(policies), np.zeros(policies))
-    return Prospect(outcome, outcome)
+    return LossBounds(outcome, outcome)
 
 
-UNKNOWN = Prospect(None, None)
+UNKNOWN = LossBounds(None, None)
 
 
 @pytest.mark.parametrize(
     ("options", "verdict"),
     [
-        ({IDEAL: known(0.03)}, IDEAL),
-        ({IDEAL: known(0.5), LOOP: known(0.04), THROUGH: known(0.0)}, LOOP),
-        ({IDEAL: known(0.5), RANDOMISE: known(0.04), THROUGH: known(0.0)}, RANDOMISE),
-        ({IDEAL: known(0.5), RANDOMISE: known(0.2), THROUGH: known(0.04)}, THROUGH),
+        ({IDEAL: bounds_at(0.03)}, IDEAL),
+        ({IDEAL: bounds_at(0.5), LOOP: bounds_at(0.04), THROUGH: bounds_at(0.0)}, LOOP),
+        ({IDEAL: bounds_at(0.5), RANDOMIZE: bounds_at(0.04), THROUGH: bounds_at(0.0)}, RANDOMIZE),
+        ({IDEAL: bounds_at(0.5), RANDOMIZE: bounds_at(0.2), THROUGH: bounds_at(0.04)}, THROUGH),
         (
-            {IDEAL: known(0.5), RANDOMISE: known(0.24), THROUGH: known(0.2)},
-            RANDOMISE,
-        ),  # as good, and takes less
-        ({IDEAL: known(0.5), RANDOMISE: known(0.3), THROUGH: known(0.2)}, THROUGH),  # in part
-        ({IDEAL: known(0.5), RANDOMISE: known(0.48), THROUGH: known(0.47)}, BUY),
-        ({IDEAL: known(0.5), RANDOMISE: UNKNOWN, THROUGH: known(0.47)}, MEASURE),
-        ({IDEAL: known(0.5), THROUGH: UNKNOWN}, MEASURE),
+            {IDEAL: bounds_at(0.5), RANDOMIZE: bounds_at(0.24), THROUGH: bounds_at(0.2)},
+            RANDOMIZE,
+        ),  # As good, with less effort.
         (
-            {IDEAL: known(0.5), THROUGH: Prospect(None, known(0.2).least)},
+            {IDEAL: bounds_at(0.5), RANDOMIZE: bounds_at(0.3), THROUGH: bounds_at(0.2)},
+            THROUGH,
+        ),  # A partial remedy.
+        ({IDEAL: bounds_at(0.5), RANDOMIZE: bounds_at(0.48), THROUGH: bounds_at(0.47)}, BUY),
+        ({IDEAL: bounds_at(0.5), RANDOMIZE: UNKNOWN, THROUGH: bounds_at(0.47)}, MEASURE),
+        ({IDEAL: bounds_at(0.5), THROUGH: UNKNOWN}, MEASURE),
+        (
+            {IDEAL: bounds_at(0.5), THROUGH: LossBounds(None, bounds_at(0.2).lower)},
             MEASURE,
-        ),  # 0.2 at least, which would win
+        ),  # The loss is at least 0.2, and could be the best.
         (
-            {IDEAL: Prospect(None, known(0.0).least), THROUGH: UNKNOWN},
+            {IDEAL: LossBounds(None, bounds_at(0.0).lower), THROUGH: UNKNOWN},
             MEASURE,
-        ),  # beyond tests, which cost nothing
+        ),  # Beyond the tests, which cost nothing.
     ],
 )
-def test_the_rule(options, verdict):
+def test_decide_follows_its_rule(options, verdict):
     assert decide(options) == verdict
 
 
-def test_verdicts(evidence):
+def test_verdicts_of_lags_and_loops(evidence):
     step = find_task("pendulum").step_duration
     assert advise(Lag(0.0), "pendulum", evidence).verdict == IDEAL
-    assert (
-        advise(Lag(2 * step), "pendulum", evidence).verdict == THROUGH
-    )  # which keeps all but 0.02
+    assert advise(Lag(2 * step), "pendulum", evidence).verdict == THROUGH  # This loses only 0.02.
     assert (
         advise(Lag(3 * step), "pendulum", evidence).verdict == MEASURE
-    )  # more than was trained through
-    untried = advise(Lag(3 * find_task("cartpole").step_duration), "cartpole", evidence)
-    assert (untried.verdict, untried.options[THROUGH]) == (MEASURE, UNKNOWN)
+    )  # More lag than in training.
+    untested = advise(Lag(3 * find_task("cartpole").step_duration), "cartpole", evidence)
+    assert (untested.verdict, untested.options[THROUGH]) == (MEASURE, UNKNOWN)
     random = [
         {**row, "trained": "random", "score": "0.99"}
         for row in evidence.rows
         if row["tested"] == "lag 4"
     ]
-    known_of = advise(
+    randomized = advise(
         Lag(3 * find_task("cartpole").step_duration),
         "cartpole",
         Evidence([*evidence.rows, *random]),
     )
-    assert known_of.verdict == RANDOMISE  # no less lag was tested, and cost 0.01
-    assert known_of.options[RANDOMISE].most.loss.mean == pytest.approx(0.01, abs=2e-3)
+    assert randomized.verdict == RANDOMIZE  # A test with more lag cost 0.01.
+    assert randomized.options[RANDOMIZE].upper.loss.mean == pytest.approx(0.01, abs=2e-3)
     late = advise(named_actuator("weaker", "pendulum"), "pendulum", evidence)
     assert late.verdict == LOOP
-    assert late.options[LOOP].most.loss.mean < 0.05
-    assert "with that 0.0" in late.reason
+    assert late.options[LOOP].upper.loss.mean < 0.05
+    assert "with this option 0.0" in late.reason
 
 
-def test_randomising_comes_first_where_it_was_as_good():
-    found = Evidence(list(results(proportional, generic=0.03)))
+def test_randomization_is_preferred_if_it_is_as_good():
+    evidence_ = Evidence(list(results(proportional, generic=0.03)))
     lag = Lag(2 * find_task("pendulum").step_duration)
-    assert advise(lag, "pendulum", found).verdict == RANDOMISE
+    assert advise(lag, "pendulum", evidence_).verdict == RANDOMIZE
 
 
-def test_buying_takes_that_all_that_was_tried_with_no_more_of_it_failed():
+def test_buying_requires_that_every_option_failed_at_most_as_severe_conditions():
     hopeless = Evidence(list(results(proportional, matched=0.4, generic=0.42)))
 
     def at_most(share):
-        drive = supplied("pendulum", 100.0)
+        drive = drive_on_supply("pendulum", 100.0)
         limited = dataclasses.replace(
             drive.controller, max_current=share * drive.controller.max_current
         )
         return advise(dataclasses.replace(drive, controller=limited), "pendulum", hopeless)
 
     assert at_most(0.45).verdict == BUY
-    assert at_most(0.45).options[THROUGH].least.loss.mean == pytest.approx(0.4)
-    assert at_most(0.8).verdict == MEASURE  # less is missing than was trained through
+    assert at_most(0.45).options[THROUGH].lower.loss.mean == pytest.approx(0.4)
+    assert at_most(0.8).verdict == MEASURE  # Less is missing than in training.
 
 
-def test_several_things_cost_their_sum(evidence):
+def test_losses_of_several_axes_are_added(evidence):
     step = find_task("pendulum").step_duration
     lag, weak, both = (
-        advise(one, "pendulum", evidence).options[IDEAL].most.loss.mean
-        for one in (Lag(step), Lag(0.0, gain=0.9), Lag(step, gain=0.9))
+        advise(actuator, "pendulum", evidence).options[IDEAL].upper.loss.mean
+        for actuator in (Lag(step), Lag(0.0, gain=0.9), Lag(step, gain=0.9))
     )
     assert both == pytest.approx(lag + weak, abs=2e-3)
 
 
-def test_a_tested_drive_is_known_by_its_own_tests_and_not_without_them():
-    """Ideal-trained policies lose 0.5 by any weakness; those that were trained through the marginal motor 0.02."""
-    rows = list(results(lambda axis, dose: 0.5 * (axis == "weakness" and dose > 0)))
+def test_the_tests_of_a_drive_itself_are_used():
+    """Weakness costs ideal-trained policies 0.5, and those trained on the marginal motor 0.02."""
+    rows = list(results(lambda axis, severity: 0.5 * (axis == "weakness" and severity > 0)))
     motor = [
         {
             "task": "pendulum",
@@ -337,122 +360,128 @@ def test_a_tested_drive_is_known_by_its_own_tests_and_not_without_them():
         for trained, score in (("ideal", "0.5"), ("marginal motor", "0.98"))
         for seed in SEEDS
     ]
-    actuator = posed("pendulum", REAL["pendulum"]["marginal motor"]).actuator
+    actuator = study_env("pendulum", REAL["pendulum"]["marginal motor"]).actuator
     tested = Evidence([*rows, *motor])
-    assert advise(actuator, "pendulum", tested).options[THROUGH].most.loss.mean == pytest.approx(
+    assert advise(actuator, "pendulum", tested).options[THROUGH].upper.loss.mean == pytest.approx(
         0.02
     )
     assert advise(actuator, "pendulum", tested).verdict == THROUGH
     assert advise(actuator, "pendulum", tested.without("marginal motor")).verdict == MEASURE
 
 
-def test_commanding_more_makes_up_for_what_a_gear_loses(evidence):
-    """A gear that passes on 80 % under a motor that has current to spare, asked for 1.25 times the force."""
-    drive = supplied("pendulum", 100.0)
+def test_a_larger_command_compensates_the_losses_of_a_gear(evidence):
+    """The gear has an efficiency of 80 %, and its motor spare current for 1.25 times the force."""
+    drive = drive_on_supply("pendulum", 100.0)
     limit = dataclasses.replace(drive.controller, max_current=2.0 * drive.controller.max_current)
     lossy = dataclasses.replace(
         drive, motor=dataclasses.replace(drive.motor, gear_efficiency=0.8), controller=limit
     )
-    found = advise(lossy, "pendulum", evidence)
-    assert found.found.at_rest == pytest.approx(0.8, abs=1e-3)
-    assert (found.verdict, "by 1.25" in found.reason) == (COMMAND, True)
-    short = dataclasses.replace(lossy, controller=drive.controller)  # no current to spare
-    found = advise(short, "pendulum", evidence)
-    assert found.options[COMMAND].least.loss.mean == pytest.approx(
-        found.options[IDEAL].least.loss.mean, abs=0.01
+    advice = advise(lossy, "pendulum", evidence)
+    assert advice.delivery.at_rest == pytest.approx(0.8, abs=1e-3)
+    assert (advice.verdict, "by 1.25" in advice.reason) == (COMMAND, True)
+    short = dataclasses.replace(lossy, controller=drive.controller)  # No spare current.
+    advice = advise(short, "pendulum", evidence)
+    assert advice.options[COMMAND].lower.loss.mean == pytest.approx(
+        advice.options[IDEAL].lower.loss.mean, abs=0.01
     )
 
 
-def test_more_than_was_tested_is_no_reason_to_buy_where_it_cost_nothing():
+def test_an_untested_severity_without_tested_loss_is_to_be_measured():
     harmless = Evidence(
-        list(results(lambda axis, dose: 0.0 if axis == "weakness" else proportional(axis, dose)))
+        list(
+            results(
+                lambda axis, severity: 0.0 if axis == "weakness" else proportional(axis, severity)
+            )
+        )
     )
-    drive = supplied("acrobot", 100.0)
+    drive = drive_on_supply("acrobot", 100.0)
     limited = dataclasses.replace(drive.controller, max_current=0.1 * drive.controller.max_current)
-    found = advise(dataclasses.replace(drive, controller=limited), "acrobot", harmless)
-    assert (found.verdict, found.options[IDEAL].most) == (MEASURE, None)
-    assert "at least 0.00" in found.reason
+    advice = advise(dataclasses.replace(drive, controller=limited), "acrobot", harmless)
+    assert (advice.verdict, advice.options[IDEAL].upper) == (MEASURE, None)
+    assert "at least 0.00" in advice.reason
 
 
-def test_more_than_is_asked_for_is_not_called_harmless(evidence):
+def test_excess_force_is_not_called_negligible(evidence):
     assert advise(Lag(0.0, gain=3.0), "pendulum", evidence).verdict == MEASURE
 
 
-def test_a_force_that_nobody_asked_for_is_not_called_harmless(evidence):
-    """A sensor that reads 0.1 A too much: a loop with an integrator takes -0.1 A for none."""
+def test_a_force_without_command_is_not_called_negligible(evidence):
+    """With a sensor offset of 0.1 A, a loop with an integrator settles at -0.1 A."""
     paper = named_actuator("paper", "pendulum")
-    wrong = dataclasses.replace(
+    biased = dataclasses.replace(
         paper, controller=dataclasses.replace(paper.controller, current_bias=0.1)
     )
-    found = advise(wrong, "pendulum", evidence)
-    assert (found.verdict, "nothing is asked for" in found.reason) == (MEASURE, True)
+    advice = advise(biased, "pendulum", evidence)
+    assert (advice.verdict, "at a command of zero" in advice.reason) == (MEASURE, True)
     share = (
         0.1 * paper.motor.torque_constant / paper.motor.arm_radius / find_task("pendulum").max_force
     )
-    assert found.found.unasked == pytest.approx(share, rel=0.05)
+    assert advice.delivery.unasked == pytest.approx(share, rel=0.05)
 
 
-def test_the_largest_dose_is_not_beyond_it(evidence):
-    found = advise(
-        AXES["supply"].at("acrobot", AXES["supply"].doses[-1]).actuator, "acrobot", evidence
+def test_the_largest_tested_severity_is_not_beyond_the_tests(evidence):
+    advice = advise(
+        AXES["supply"].make_env("acrobot", AXES["supply"].severities[-1]).actuator,
+        "acrobot",
+        evidence,
     )
-    assert not any(loss.beyond for loss in found.losses)
+    assert not any(loss.beyond for loss in advice.losses)
 
 
-def test_a_ringing_loop_is_late(evidence):
-    """Poles of 0.9 rad a step with a damping ratio of 0.1: an overshoot of exp(-pi*0.1/sqrt(0.99)) = 73 %."""
+def test_ringing_counts_as_lag(evidence):
+    """Poles of 0.9 rad a step with damping 0.1 overshoot by exp(-pi*0.1/sqrt(0.99)) = 73 %."""
     speed = 0.9 / find_task("pendulum").step_duration
     loop = CurrentLoop(kp=0.0, ki=speed**2, max_voltage=1e6, substeps=100)
-    found = advise(DCMotorActuator(Motor(0.2 * speed, 1.0, 1.0, 1.0), loop), "pendulum", evidence)
-    assert found.found.lag > 1.0
-    assert found.verdict != IDEAL
+    advice = advise(DCMotorActuator(Motor(0.2 * speed, 1.0, 1.0, 1.0), loop), "pendulum", evidence)
+    assert advice.delivery.lag > 1.0
+    assert advice.verdict != IDEAL
 
 
-def test_a_detuned_drive_is_told_to_design_its_loop(evidence):
-    drive = supplied("pendulum", 100.0)
+def test_a_detuned_drive_is_advised_to_design_its_loop(evidence):
+    drive = drive_on_supply("pendulum", 100.0)
     slow = dataclasses.replace(drive.controller, bandwidth=0.3)
     assert advise(dataclasses.replace(drive, controller=slow), "pendulum", evidence).verdict == LOOP
     well = advise(drive, "pendulum", evidence)
     assert (LOOP in well.options, well.verdict) == (False, IDEAL)
 
 
-def test_a_designed_loop_keeps_the_supply_and_does_not_cure_a_sensor(evidence):
+def test_a_designed_loop_keeps_the_supply_and_is_not_offered_for_sensor_errors(evidence):
     paper = named_actuator("paper", "pendulum")
     sagging = dataclasses.replace(paper, supply=Supply(5.0, 0.3))
-    assert redesign(sagging, "pendulum").supply == Supply(5.0, 0.3)
+    assert redesign_loop(sagging, "pendulum").supply == Supply(5.0, 0.3)
     noisy = dataclasses.replace(
         paper, controller=dataclasses.replace(paper.controller, current_noise=0.1)
     )
-    assert redesign(noisy, "pendulum") is None
+    assert redesign_loop(noisy, "pendulum") is None
     assert LOOP not in advise(noisy, "pendulum", evidence).options
 
 
 def test_without_results_there_is_no_verdict():
-    found = advise(Lag(1.0), "cartpole", Evidence([]))
-    assert found.verdict is None
-    assert "measure" in found.reason
+    advice = advise(Lag(1.0), "cartpole", Evidence([]))
+    assert advice.verdict is None
+    assert "measure" in advice.reason
 
 
 # measured
 
 
 @pytest.mark.parametrize(
-    ("ideal", "designed", "randomised", "through", "verdict"),
+    ("ideal", "designed", "randomized", "through", "verdict"),
     [
         (0.97, 1.0, 1.0, 1.0, IDEAL),
         (0.5, 0.96, 1.0, 1.0, LOOP),
-        (0.5, 0.6, 0.96, 0.97, RANDOMISE),
+        (0.5, 0.6, 0.96, 0.97, RANDOMIZE),
         (0.5, 0.6, 0.6, 0.96, THROUGH),
         (0.5, 0.6, 0.6, 0.7, THROUGH),
         (0.5, 0.6, 0.52, 0.52, LOOP),
         (0.5, 0.54, 0.52, 0.52, BUY),
     ],
 )
-def test_the_verdict_of_a_measurement(tmp_path, ideal, designed, randomised, through, verdict):
-    asked = measurement(named_actuator("weaker", "cartpole"), "cartpole", 4, tmp_path)
+def test_the_verdict_of_a_measurement(tmp_path, ideal, designed, randomized, through, verdict):
+    measurement = plan_measurement(named_actuator("weaker", "cartpole"), "cartpole", 4, tmp_path)
 
     def score(trial, seed):
-        level = {"cartpole: through it": through, "cartpole: generic": randomised}.get(
+        level = {"cartpole: through it": through, "cartpole: generic": randomized}.get(
             trial.arm.name
         )
         level = (
@@ -460,48 +489,48 @@ def test_the_verdict_of_a_measurement(tmp_path, ideal, designed, randomised, thr
         )
         return FLOORS["cartpole"] + 200.0 * (level + 0.001 * (-1) ** seed)
 
-    pretend(asked.grid, score)
-    found = asked.judged(asked.grid.collect())
-    assert decide(found) == verdict
-    kept = [1.0 - found[name].most.loss.mean for name in (IDEAL, LOOP, RANDOMISE, THROUGH)]
-    assert kept == pytest.approx([ideal, designed, randomised, through])
-    # of four policies +-0.001 around the mean: Student's t of three degrees of freedom
-    mean, low, _ = found[LOOP].most.loss
+    pretend(measurement.grid, score)
+    options = measurement.loss_bounds(measurement.grid.collect())
+    assert decide(options) == verdict
+    scores = [1.0 - options[name].upper.loss.mean for name in (IDEAL, LOOP, RANDOMIZE, THROUGH)]
+    assert scores == pytest.approx([ideal, designed, randomized, through])
+    # Four policies at +-0.001 around the mean: Student's t with three degrees of freedom.
+    mean, low, _ = options[LOOP].upper.loss
     assert mean - low == pytest.approx(3.18245 * 0.001 * math.sqrt(4 / 3) / 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("task", ["cartpole", "pendulum"])
-def test_the_study_s_tasks_are_measured_as_the_study_has_them(task, tmp_path):
-    """By the reward that its floors are of: on CartPole the paper's."""
-    asked = measurement("weaker", task, 2, tmp_path)
-    assert asked.home.env == posed(task)
-    assert {trial.env for trial in asked.options.values()} == {
-        posed(task, "weaker"),
-        posed(task, redesign(named_actuator("weaker", task), task)),
+def test_measurements_use_the_study_s_environments(task, tmp_path):
+    """The rewards are those of the study's floors: on CartPole the paper's."""
+    measurement = plan_measurement("weaker", task, 2, tmp_path)
+    assert measurement.baseline.env == study_env(task)
+    assert {trial.env for trial in measurement.options.values()} == {
+        study_env(task, "weaker"),
+        study_env(task, redesign_loop(named_actuator("weaker", task), task)),
     }
 
 
-def test_a_measurement_that_is_not_finished_says_so(tmp_path):
-    asked = measurement(named_actuator("weaker", "cartpole"), "cartpole", 2, tmp_path)
-    pretend(asked.grid, lambda *_: 100.0, leaving_out=[("cartpole: through it", 1)])
+def test_raises_if_a_measurement_is_not_finished(tmp_path):
+    measurement = plan_measurement(named_actuator("weaker", "cartpole"), "cartpole", 2, tmp_path)
+    pretend(measurement.grid, lambda *_: 100.0, leaving_out=[("cartpole: through it", 1)])
     with pytest.raises(ValueError, match=r"1 of its trainings and tests are missing"):
-        asked.judged(asked.grid.collect())
+        measurement.loss_bounds(measurement.grid.collect())
 
 
-def test_a_run_is_measured_with_its_own_environment_agent_and_budget(tmp_path):
+def test_a_run_is_measured_with_its_environment_agent_and_budget(tmp_path):
     config = TrainConfig.preset(
         "cartpole", "ppo", total_steps=3000, env={"inner_steps": 20, "actuator": "weak"}
     )
     write_json(tmp_path / "run" / "config.json", {"train": config.as_mapping()})
-    asked = measurement("weaker", str(tmp_path / "run"), 2, tmp_path)
-    for arm in asked.grid.arms:
+    measurement = plan_measurement("weaker", str(tmp_path / "run"), 2, tmp_path)
+    for arm in measurement.grid.arms:
         assert (arm.config.total_steps, arm.config.env.inner_steps) == (3000, 20)
-    assert asked.home.env.actuator == IDEAL_ACTUATOR
-    assert asked.options[THROUGH].env.actuator == named_actuator("weaker", "cartpole")
+    assert measurement.baseline.env.actuator == IDEAL_ACTUATOR
+    assert measurement.options[THROUGH].env.actuator == named_actuator("weaker", "cartpole")
 
 
 @pytest.mark.matrix
-def test_an_environment_of_others_is_measured_beside_random_actions_of_its_own(tmp_path, capsys):
+def test_a_third_party_environment_is_measured_relative_to_its_random_actions(tmp_path, capsys):
     config = TrainConfig.preset("InvertedPendulum-v5", "ppo", total_steps=4096, num_envs=2)
     write_json(tmp_path / "run" / "config.json", {"train": config.as_mapping()})
     words = [
@@ -515,10 +544,10 @@ def test_an_environment_of_others_is_measured_beside_random_actions_of_its_own(t
         "--json",
     ]
     assert cli.main(words) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["advice"] is None
-    assert set(found["measured"]["options"]) == {IDEAL, THROUGH}
-    assert found["measured"]["options"][IDEAL]["most"]["policies"] == 2
+    content = json.loads(capsys.readouterr().out)
+    assert content["advice"] is None
+    assert set(content["measured"]["options"]) == {IDEAL, THROUGH}
+    assert content["measured"]["options"][IDEAL]["most"]["policies"] == 2
 
 
 # the command line
@@ -534,24 +563,24 @@ def file(tmp_path, rows):
     return path
 
 
-def test_on_the_command_line_with_results_and_runs(tmp_path, file, capsys):
-    asked = measurement("weaker", "cartpole", 2, tmp_path / "runs")
-    pretend(asked.grid, lambda _, seed: 100.0 + seed)
+def test_the_command_line_reports_evidence_and_measurement(tmp_path, file, capsys):
+    measurement = plan_measurement("weaker", "cartpole", 2, tmp_path / "runs")
+    pretend(measurement.grid, lambda _, seed: 100.0 + seed)
     words = ["advise", "weaker", "cartpole", "--evidence", str(file), "--measure", "2"]
     words += ["--root", str(tmp_path / "runs")]
     assert cli.main(words) == 0
     shown = capsys.readouterr().out
-    assert f"{LOOP}: policies that never met it lose " in shown
+    assert f"{LOOP}: policies trained on ideal forces lose " in shown
     assert f"measured: {IDEAL}" in shown
     assert cli.main([*words, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
-    assert found["advice"]["verdict"] == LOOP
-    assert found["advice"]["losses"][0]["axis"] == "lag"
-    assert found["measured"]["options"][IDEAL]["most"]["loss"]["mean"] == pytest.approx(0.0)
+    content = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert content["advice"]["verdict"] == LOOP
+    assert content["advice"]["losses"][0]["axis"] == "lag"
+    assert content["measured"]["options"][IDEAL]["most"]["loss"]["mean"] == pytest.approx(0.0)
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "much"])
-def test_evidence_that_is_no_number_is_refused(tmp_path, file, value):
+def test_raises_if_the_evidence_has_no_number(tmp_path, file, value):
     lines = file.read_text().splitlines()
     cells = lines[2].split(",")
     cells[lines[0].split(",").index("score")] = value
@@ -564,7 +593,7 @@ def test_evidence_that_is_no_number_is_refused(tmp_path, file, value):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["papr", "cartpole"], "did you mean 'paper'"),
         (["paper", "cartpol"], "did you mean 'cartpole'"),
@@ -579,16 +608,16 @@ def test_evidence_that_is_no_number_is_refused(tmp_path, file, value):
         (["lag", "pendulum", "--voltage", "3"], "--voltage: "),
     ],
 )
-def test_bad_input_is_told(words, said, capsys):
+def test_bad_input_is_reported(words, message, capsys):
     assert cli.main(["advise", *words]) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("gear", "volts"), [(59.0, 9.0), (59.0, 3.0), (2.0, 9.0)])
-def test_a_motor_s_gear_and_supply_are_the_command_line_s(gear, volts, file, capsys):
+def test_flags_set_the_gear_and_supply_of_a_motor(gear, volts, file, capsys):
     words = ["advise", "maxon-dcx22l", "pendulum", "--evidence", str(file), "--json"]
     assert cli.main([*words, "--gear-ratio", str(gear), "--voltage", str(volts)]) == 0
-    found = json.loads(capsys.readouterr().out)["advice"]["found"]
+    content = json.loads(capsys.readouterr().out)["advice"]["found"]
     drive, force = (
         find_drive("maxon-dcx22l", gear_ratio=gear, voltage=volts),
         find_task("pendulum").max_force,
@@ -600,15 +629,17 @@ def test_a_motor_s_gear_and_supply_are_the_command_line_s(gear, volts, file, cap
         expected = min(
             float(torque_limits(frictionless, speed, drive.controller.max_current)[1]) / force, 1.0
         )
-        assert found[name] == pytest.approx(expected, rel=2e-3), name
-    assert found["friction"] == pytest.approx(gear * drive.motor.coulomb_friction / force, rel=1e-3)
+        assert content[name] == pytest.approx(expected, rel=2e-3), name
+    assert content["friction"] == pytest.approx(
+        gear * drive.motor.coulomb_friction / force, rel=1e-3
+    )
 
 
-def test_what_is_assumed_of_a_motor_is_said(file, capsys):
+def test_assumptions_about_a_motor_are_reported(file, capsys):
     assert (
         cli.main(
             ["advise", "maxon-dcx22l", "pendulum", "--gear-ratio", "59", "--evidence", str(file)]
         )
         == 0
     )
-    assert "assumed, for none is given: controller.max_current = inf" in capsys.readouterr().out
+    assert "assumed, because not specified: controller.max_current = inf" in capsys.readouterr().out

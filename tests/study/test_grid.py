@@ -1,4 +1,4 @@
-"""The grid: each cell once, whatever happens to the others, to the grid, and wherever it is computed."""
+"""The grid: each cell is computed once, whatever happens to other cells or to the grid."""
 
 import dataclasses
 import json
@@ -36,7 +36,7 @@ ONE = Workers(jobs=1)
 
 
 def train_cells(cells, root, workers=ONE, on_run=lambda _: None):
-    """Run folders by name, and what failed by its run folder."""
+    """Train cells; return run folders by name and errors by run folder."""
     folders = {name: cell_folder(root, config) for name, config in cells.items()}
     return folders, train_runs(
         dict(zip(folders.values(), cells.values(), strict=True)), workers, on_run, tensorboard=False
@@ -49,7 +49,7 @@ def weights(folder):
 
 @pytest.fixture(scope="module")
 def computed(tmp_path_factory):
-    """A grid in two processes, one of whose cells cannot be trained."""
+    """Return a grid computed in two processes; one of its cells cannot be trained."""
     root = tmp_path_factory.mktemp("grid")
     reported = []
     cells = CELLS | {"unstable": dataclasses.replace(TINY, env=UNSTABLE)}
@@ -74,7 +74,7 @@ def test_a_cell_that_fails_is_recorded_and_does_not_stop_the_others(computed):
 
 
 @pytest.mark.matrix
-def test_a_cell_is_an_ordinary_run_folder_keyed_by_its_configuration(computed):
+def test_a_cell_is_a_run_folder_named_by_its_configuration(computed):
     root, runs, _, _ = computed
     for name, config in CELLS.items():
         assert runs[name] == cell_folder(root, config)
@@ -89,7 +89,7 @@ def test_a_cell_is_an_ordinary_run_folder_keyed_by_its_configuration(computed):
 
 
 @pytest.mark.matrix
-def test_finished_cells_are_left_alone(computed):
+def test_finished_cells_are_skipped(computed):
     root, runs, _, _ = computed
     before = {path: path.stat().st_mtime_ns for run in runs.values() for path in run.rglob("*")}
     reported = []
@@ -98,7 +98,7 @@ def test_finished_cells_are_left_alone(computed):
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
-def test_a_failure_is_forgotten_when_the_cell_succeeds(tmp_path):
+def test_a_failure_record_is_deleted_when_the_cell_succeeds(tmp_path):
     folder = cell_folder(tmp_path, TINY)
     folder.write_text("a file in the way")
     assert "is not a folder" in train_runs({folder: TINY}, ONE)[folder]
@@ -110,7 +110,7 @@ def test_a_failure_is_forgotten_when_the_cell_succeeds(tmp_path):
 
 
 @pytest.mark.matrix
-def test_ray_computes_the_same(computed, tmp_path):
+def test_ray_computes_the_same_results(computed, tmp_path):
     _, runs, _, _ = computed
     ray_runs, failures = train_cells(
         CELLS | {"unstable": dataclasses.replace(TINY, env=UNSTABLE)},
@@ -123,7 +123,7 @@ def test_ray_computes_the_same(computed, tmp_path):
 
 
 @pytest.mark.matrix
-def test_a_killed_grid_goes_on_where_it_was(computed, tmp_path):
+def test_a_killed_grid_continues(computed, tmp_path):
     _, runs, _, _ = computed
     code = """
 import sys
@@ -146,7 +146,10 @@ train_cells(CELLS, Path(sys.argv[1]), Workers(jobs=2))
 
 @pytest.mark.matrix
 def test_a_ctrl_c_lets_trainings_write_their_checkpoints(tmp_path):
-    """As a terminal does it: to the grid and all its processes. One of them has nothing to do, a cell is not begun."""
+    """Send SIGINT to the grid and all its processes, as a terminal does.
+
+    One process is idle, and a cell has not started.
+    """
     code = """
 import dataclasses, sys
 from pathlib import Path
@@ -186,13 +189,13 @@ except TrainingStoppedError as stopped:
         assert not (root / "2").exists()
 
 
-def test_what_a_call_raises_is_raised():
+def test_an_exception_in_a_call_is_raised():
     with pytest.raises(ZeroDivisionError):
         list(compute(divmod, [(1, 1), (1, 0)], Workers(jobs=2)))
 
 
 @pytest.mark.matrix
-def test_deployments_are_evaluations_that_are_made_once(computed):
+def test_deployments_are_evaluated_once(computed):
     _, runs, _, _ = computed
     deployments = {
         name: Deployment(runs["seed 0"], EnvConfig("cartpole", name), episodes=3, seed=7)
@@ -209,11 +212,11 @@ def test_deployments_are_evaluations_that_are_made_once(computed):
     assert len(before) == 2
     deploy_cells(deployments, ONE)
     assert {record: record.stat().st_mtime_ns for record in before} == before
-    other = Deployment(
+    other_env = Deployment(
         runs["seed 0"], EnvConfig("cartpole", max_episode_steps=5), episodes=3, seed=7
     )
-    deploy_cells({"short": other}, ONE)
-    assert json.loads(other.record.read_text())["length"]["mean"] == 5.0
+    deploy_cells({"short": other_env}, ONE)
+    assert json.loads(other_env.record.read_text())["length"]["mean"] == 5.0
 
 
 @pytest.mark.matrix
@@ -235,7 +238,7 @@ def test_a_deployment_that_fails_is_recorded_and_does_not_stop_the_others(comput
 
 
 @pytest.mark.matrix
-def test_a_failure_of_a_deployment_is_forgotten_when_it_succeeds(computed):
+def test_a_failure_record_of_a_deployment_is_deleted_when_it_succeeds(computed):
     _, runs, _, _ = computed
     deployment, policy = (
         Deployment(runs["seed 2"], IDEAL, episodes=2),
@@ -261,14 +264,14 @@ def test_a_failure_of_a_deployment_is_forgotten_when_it_succeeds(computed):
         ("jobs", 2.5, ">= 1, or -1"),
     ],
 )
-def test_impossible_workers_are_refused(field, value, expected):
+def test_raises_if_the_workers_are_invalid(field, value, expected):
     with pytest.raises(ValueError, match=field) as caught:
         Workers(**{field: value})
     assert f"{field} = {value!r}" in str(caught.value)
     assert expected in str(caught.value)
 
 
-def test_ray_that_is_not_installed_is_named(tmp_path, monkeypatch):
+def test_raises_if_ray_is_not_installed(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ValueError, match=r"pip install 'codrl-mj\[ray\]'"):
         train_runs({tmp_path: TINY}, Workers(backend="ray"))

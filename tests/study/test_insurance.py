@@ -1,4 +1,4 @@
-"""The study of what insures a policy: its actuator against the package's own, its arms, and its page."""
+"""The study of robust training: its actuator against the package's, its arms and its page."""
 
 import itertools
 import shutil
@@ -10,7 +10,7 @@ import pytest
 from actuator_study.arms import DRAWN
 from codrl_mj.actuators import Lag
 from codrl_mj.disturbances import Disturbances
-from codrl_mj.study.doses import AXES, FLOORS, posed, timestep
+from codrl_mj.study.axes import AXES, FLOORS, study_env, timestep
 from codrl_mj.study.evidence import Evidence
 from codrl_mj.study.pages import read_csv, write_csv
 from codrl_mj.tasks import find_task
@@ -37,75 +37,85 @@ from tests.study.pretended import pretend
 RESULTS = Path(__file__).parents[2] / "docs/results"
 
 
-def played(config, actions):
-    """Observations without what is seen of the actuator, and everything that is seen, of given actions."""
+def play(config, actions):
+    """Return observations without the actuator's entries, and all of them, for given actions."""
     env = config.make()
-    seen = [env.reset(seed=3)[0]]
-    seen += [env.step(action)[0] for action in actions]
+    observations = [env.reset(seed=3)[0]]
+    observations += [env.step(action)[0] for action in actions]
     env.close()
-    return np.array(seen)
+    return np.array(observations)
 
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("steps", [0.0, 0.25, 0.8])
 @pytest.mark.parametrize("lag", [0.0, 0.7])
-def test_late_is_lag_where_lag_remembers_enough(task, steps, lag):
+def test_late_equals_lag_if_the_delay_fits_into_lag(task, steps, lag):
     step, gain = find_task(task).step_duration, 0.8
-    actions = [posed(task).make().action_space.sample() for _ in range(40)]
-    ours = posed(task, late(task, time_constant=lag * step, delay=steps * step, gain=gain))
-    theirs = posed(task, Lag(lag * step, steps * step, gain))
-    np.testing.assert_allclose(played(ours, actions), played(theirs, actions), rtol=0, atol=1e-12)
+    actions = [study_env(task).make().action_space.sample() for _ in range(40)]
+    ours = study_env(task, late(task, time_constant=lag * step, delay=steps * step, gain=gain))
+    theirs = study_env(task, Lag(lag * step, steps * step, gain))
+    np.testing.assert_allclose(play(ours, actions), play(theirs, actions), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("steps", [0.5, 1.0, 1.25, 2.0, 3.3, 4.0])
-def test_a_longer_delay_is_that_of_the_environment(task, steps):
+def test_a_longer_delay_equals_the_environment_s_command_delay(task, steps):
     step = find_task(task).step_duration
-    actions = [posed(task).make().action_space.sample() for _ in range(40)]
-    ours = posed(task, late(task, delay=steps * step))
-    theirs = posed(task, disturbances=Disturbances(command_delay=steps * step))
-    np.testing.assert_allclose(played(ours, actions), played(theirs, actions), rtol=0, atol=1e-12)
+    actions = [study_env(task).make().action_space.sample() for _ in range(40)]
+    ours = study_env(task, late(task, delay=steps * step))
+    theirs = study_env(task, disturbances=Disturbances(command_delay=steps * step))
+    np.testing.assert_allclose(play(ours, actions), play(theirs, actions), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_what_is_shown_is_the_last_four_commands(task):
-    config = posed(
+def test_the_observation_has_the_last_four_commands(task):
+    config = study_env(
         task, late(task, delay=1.3 * find_task(task).step_duration), observe_actuator=True
     )
-    space = posed(task).make().action_space
+    space = study_env(task).make().action_space
     actions = [space.sample() for _ in range(12)]
-    shown = played(config, actions)[:, -4:]
-    given = [0.0, 0.0, 0.0, 0.0, *(float(np.ravel(action)[0]) for action in actions)]
+    shown = play(config, actions)[:, -4:]
+    commands = [0.0, 0.0, 0.0, 0.0, *(float(np.ravel(action)[0]) for action in actions)]
     if task == "acrobot":  # 0, 1, 2 are -1, 0 and 1 times the largest torque
-        given[4:] = [value - 1.0 for value in given[4:]]
+        commands[4:] = [value - 1.0 for value in commands[4:]]
     largest = find_task(task).max_force if task != "acrobot" else 1.0
-    wanted = [[given[at + 3 - back] / largest for back in range(4)] for at in range(13)]
-    np.testing.assert_allclose(shown, wanted, rtol=0, atol=1e-6)
+    expected = [
+        [commands[step_index + 3 - back] / largest for back in range(4)] for step_index in range(13)
+    ]
+    np.testing.assert_allclose(shown, expected, rtol=0, atol=1e-6)
 
 
-def test_a_delay_that_is_not_remembered_is_refused():
+def test_raises_if_the_delay_exceeds_the_memory():
     step = find_task("pendulum").step_duration
     with pytest.raises(ValueError, match=r"Late\.delay"):
-        posed("pendulum", late("pendulum", delay=4.1 * step)).make()
+        study_env("pendulum", late("pendulum", delay=4.1 * step)).make()
     assert timestep("pendulum") == pytest.approx(step / 10)
 
 
-def test_doses_and_reaches_follow_from_the_first_study_by_the_rules_of_the_plan():
+def test_severities_and_ranges_follow_from_the_first_study_by_the_plan():
     evidence = Evidence.read()
     for task in TASKS:
         for axis, harmless in HARMLESS[task].items():
             known = [
-                (dose, evidence.loss(task, axis, dose).outcome) for dose in AXES[axis].doses[1:]
+                (severity, evidence.loss(task, axis, severity).outcome)
+                for severity in AXES[axis].severities[1:]
             ]
-            spared = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].spared, known)]
-            assert harmless == (spared[-1] if spared else 0.0)
-            assert reach(task, axis) == (2 * harmless or AXES[axis].doses[1])
-    for axis, dose in SEVERITIES["acrobot"].items():
-        hurt = [d for d in AXES[axis].doses[1:] if evidence.loss("acrobot", axis, d).outcome.hurt]
-        assert dose == (hurt[0] if hurt else AXES[axis].doses[-1])
+            is_negligible = [
+                severity
+                for severity, _ in itertools.takewhile(lambda pair: pair[1].is_negligible, known)
+            ]
+            assert harmless == (is_negligible[-1] if is_negligible else 0.0)
+            assert reach(task, axis) == (2 * harmless or AXES[axis].severities[1])
+    for axis, severity in SEVERITIES["acrobot"].items():
+        harmful = [
+            d
+            for d in AXES[axis].severities[1:]
+            if evidence.loss("acrobot", axis, d).outcome.is_harmful
+        ]
+        assert severity == (harmful[0] if harmful else AXES[axis].severities[-1])
 
 
-def test_the_plan_is_what_is_computed():
+def test_the_study_computes_what_the_plan_states():
     plan = (RESULTS / "insurance_plan.md").read_text()
     arms = {trial.arm.name for trial in trials() if needs_new_policies(trial)}
     assert f"{len(arms)} new arms" in plan
@@ -124,16 +134,19 @@ def test_the_plan_is_what_is_computed():
             if words in line:
                 assert len(question.contrasts) == len(axes) * len(TASKS)
     for task, title in (("pendulum", "Pendulum"), ("furuta", "Furuta"), ("acrobot", "Acrobot")):
-        told = " | ".join(f"{reach(task, axis):g}" for axis in ("lag", "weakness", "delay"))
-        assert f"| {title} | {told} |" in plan
+        stated = " | ".join(f"{reach(task, axis):g}" for axis in ("lag", "weakness", "delay"))
+        assert f"| {title} | {stated} |" in plan
 
 
-def test_random_actuators_reach_as_far_as_they_are_said_to():
+def test_random_actuators_have_the_stated_ranges():
     for task in TASKS:
         step = find_task(task).step_duration
-        for share, made in ((1.0, generic(task)), (0.5, half(task)), (2.0, double(task))):
-            env = made.config.env
-            ends = {name: (one.low, one.high) for name, one in env.distributions.items()}
+        for share, random_arm in ((1.0, generic(task)), (0.5, half(task)), (2.0, double(task))):
+            env = random_arm.config.env
+            ends = {
+                name: (distribution.low, distribution.high)
+                for name, distribution in env.distributions.items()
+            }
             assert ends["time_constant"] == (0.0, pytest.approx(share * reach(task, "lag") * step))
             assert ends["delay"] == (0.0, pytest.approx(share * reach(task, "delay") * step))
             short = share * reach(task, "weakness")
@@ -145,9 +158,10 @@ def test_random_actuators_reach_as_far_as_they_are_said_to():
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """Matched training keeps 0.9 at its doses, random actuators 0.7, all else half; at home nothing is lost.
+    """Return a written study: matched training keeps 0.9, random actuators 0.7, all others half.
 
-    Commands that are seen change nothing. Four policies of every kind are all that is planned.
+    On ideal forces nothing is lost, and observed commands change nothing. Four policies of each
+    kind are planned.
     """
     out = tmp_path_factory.mktemp("insurance")
 
@@ -160,7 +174,7 @@ def written(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("insurance_study.page.PLANNED", 4)
         study = InsuranceStudy(root=out / "runs", out=out, seeds=4)
-        spread = [-0.02, 0.02, 0.01, -0.01]  # sums to 0
+        spread = [-0.02, 0.02, 0.01, -0.01]  # The sum is 0.
         pretend(
             study.grid,
             lambda trial, seed: FLOORS[trial.arm.task] + 100.0 * (level(trial) + spread[seed]),
@@ -168,7 +182,7 @@ def written(tmp_path_factory):
         yield out, list(study.write()[0])
 
 
-def test_what_is_so_stands_on_the_page(written):
+def test_the_page_states_the_true_results(written):
     out, files = written
     assert all(file.is_file() for file in files)
     rows = {row["name"]: row for row in read_csv(out / "insurance" / "hypotheses.csv")}
@@ -176,7 +190,7 @@ def test_what_is_so_stands_on_the_page(written):
         name: float(rows[name]["effect"])
         for name in ("I1", "I2", "I3", "I4", "I6", "I8", "I9", "I10")
     }
-    wanted = {
+    expected = {
         "I1": 0.2,
         "I2": 0.2,
         "I3": 0.0,
@@ -186,11 +200,13 @@ def test_what_is_so_stands_on_the_page(written):
         "I9": 0.2,
         "I10": -0.2,
     }
-    assert effects == pytest.approx(wanted, abs=1e-9)
+    assert effects == pytest.approx(expected, abs=1e-9)
     assert rows["I10"]["outcome"] == "the other way"
     assert rows["I3"]["outcome"] == "yes"
     page = (out / "insurance.md").read_text()
-    assert "| random actuators | 1.00 | 0.70, 0.70; 24 of 24;" in page  # 4 policies on 6 doses
+    assert (
+        "| random actuators | 1.00 | 0.70, 0.70; 24 of 24;" in page
+    )  # Four policies on six severities.
     assert "| the same dose | 1.00 | 0.90, 0.90;" in page
     assert "| Acrobot, a step of 200 ms | ideal forces |" in page
     assert "| delay 600 ms (400 ms) | 0.50; 4; " in page.replace("\u00a0", " ")
@@ -201,7 +217,7 @@ def test_what_is_so_stands_on_the_page(written):
     assert "not judged" not in page
 
 
-def test_nothing_is_judged_of_fewer_policies_than_are_planned(written, tmp_path):
+def test_questions_with_fewer_policies_than_planned_are_not_judged(written, tmp_path):
     out, _ = written
     (tmp_path / "insurance").mkdir()
     rows = [row for row in read_csv(out / "insurance" / "runs.csv") if int(row["seed"]) < 3]
@@ -216,16 +232,16 @@ def test_nothing_is_judged_of_fewer_policies_than_are_planned(written, tmp_path)
     }
 
 
-def test_what_policies_returned_in_tenths_of_their_training_is_published(written):
+def test_returns_in_each_tenth_of_the_training_are_published(written):
     rows = read_csv(written[0] / "insurance" / "learning.csv")
     assert len(rows) == 4 * len({trial.arm.name for trial in trials()})
     assert [float(rows[0][f"tenth_{number}"]) for number in range(1, 11)] == [
-        2 * at + 1.5 for at in range(10)
+        2 * step_count + 1.5 for step_count in range(10)
     ]
     assert len({row["run"] for row in rows}) == len(rows)
 
 
-def test_rows_stand_for_run_folders_that_are_gone(written, tmp_path):
+def test_rows_replace_deleted_run_folders(written, tmp_path):
     out, _ = written
     shutil.copytree(out / "insurance", tmp_path / "insurance")
     InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=4).write()
@@ -233,7 +249,7 @@ def test_rows_stand_for_run_folders_that_are_gone(written, tmp_path):
         assert (tmp_path / "insurance" / name).read_text() == (out / "insurance" / name).read_text()
 
 
-def test_of_how_many_kinds_of_training_the_returns_still_rise():
+def test_the_page_counts_trainings_whose_returns_still_rise():
     def runs(task, trained, *rises):
         return [
             {"task": task, "trained": trained, "tenth_8": 10.0, "tenth_10": 10.0 + rise}
@@ -246,7 +262,7 @@ def test_of_how_many_kinds_of_training_the_returns_still_rise():
     assert still_rising(rows, {"a": 100.0, "b": 1000.0}, 0.05) == (["a: up"], 4)
 
 
-def test_what_trainings_took_is_counted_once_however_often_the_page_is_written(tmp_path):
+def test_training_time_is_counted_once_if_the_page_is_written_again(tmp_path):
     study = InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=1, tasks=("furuta",))
     grid = study.grid
     pretend(grid, lambda trial, _: FLOORS[trial.arm.task] + 100.0)

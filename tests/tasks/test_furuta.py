@@ -19,7 +19,7 @@ from codrl_mj.catalogue import motor_entry
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes, summarize
 from codrl_mj.physics import MujocoPhysics, SimulationConfig
-from codrl_mj.sizing.scripted import Scripted, state_observed
+from codrl_mj.sizing.scripted import Scripted, observe_state
 from codrl_mj.tasks import TASKS, resolve_actuators
 from codrl_mj.tasks.furuta import MAX_TORQUE, ReferenceEnv
 from tests.envs.vectors import MODES, assert_equal_episodes, batched, looped
@@ -162,7 +162,7 @@ def test_energy_is_conserved_without_damping():
 
 
 def test_the_default_actuator_is_the_motor_of_the_catalog():
-    motor = Drive.of(motor_entry("quanser-qube-servo-2").numbers)
+    motor = Drive.from_motor_parameters(motor_entry("quanser-qube-servo-2").parameters)
     assert (motor.supply.voltage, motor.controller.max_current) == (18.0, 2.0)
     assert motor.motor.torque_constant * motor.controller.max_current == pytest.approx(MAX_TORQUE)
     assert EnvConfig("furuta").actuator == motor
@@ -180,14 +180,14 @@ def test_the_default_actuator_is_the_motor_of_the_catalog():
         *(
             (
                 {"actuator": name},
-                f"'{name}': a variation of the paper's actuator, of which furuta has none",
+                f"'{name}': a variation of the paper's actuator, but furuta has none",
             )
             for name in NAMED
             if name != "ideal"
         ),
         (
             {"physics": "analytic"},
-            r"the Drive's armature = 4e-06: the equations have no place for it",
+            r"the Drive's armature = 4e-06: the equations have no term for it",
         ),
     ],
 )
@@ -247,7 +247,7 @@ def test_episodes_start_hanging_within_the_reset_options():
 @every_actuator
 def test_the_scripted_controller_swings_up_and_balances(actuator):
     episodes = run_episodes(
-        Scripted(TASK), lambda: state_observed(EnvConfig("furuta", actuator).make()), 10, seed=0
+        Scripted(TASK), lambda: observe_state(EnvConfig("furuta", actuator).make()), 10, seed=0
     )
     assert summarize("furuta", episodes).success.mean == 1.0
 

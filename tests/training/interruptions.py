@@ -11,7 +11,7 @@ from pathlib import Path
 from codrl_mj.agents import DDPGConfig, DQNConfig, PPOConfig, SACConfig, SARSAConfig, TD3Config
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.runs.files import sealed, write_json
+from codrl_mj.runs.files import with_digest, write_json
 from codrl_mj.training import TrainConfig, TrainingStoppedError, train
 from codrl_mj.training.folder import prepare_run
 from codrl_mj.training.watcher import Watcher
@@ -33,7 +33,8 @@ outcome, differing = kill_test.outcome, kill_test.differing
 def begin(run, config):
     """Create a run folder in which a training has started and nothing is learned."""
     write_json(
-        run / "config.json", sealed(prepare_run(run, config, resume=False, accept_changes=False))
+        run / "config.json",
+        with_digest(prepare_run(run, config, resume=False, accept_changes=False)),
     )
 
 

@@ -16,7 +16,7 @@ import pytest
 from safetensors.numpy import save
 
 from codrl_mj.cli import main
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 from codrl_mj.training import TrainConfig, history, watcher
 from codrl_mj.training.checkpoint import State, load_checkpoint, save_checkpoint
 from tests.damage import Bomb, damage
@@ -188,11 +188,11 @@ def test_the_previous_checkpoint_is_loaded_after_any_damage(tmp_path):
 
 @pytest.fixture
 def leave_temporary_file():
-    """Leave a temporary file, as `writing` does if the process is killed in its block."""
+    """Leave a temporary file, as `atomic_write` does if the process is killed in its block."""
     entered = []
 
     def leave(path):
-        entered.append(writing(path))
+        entered.append(atomic_write(path))
         temporary = entered[-1].__enter__()
         temporary.write_bytes(b"half")
         return temporary

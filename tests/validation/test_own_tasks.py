@@ -39,7 +39,7 @@ GENTLE = ReferenceStates(
     steps=3,
     balanced_steps=1,
 )
-"""A short run, whose errors show an order at coarse steps: it is used where the cost of the default run does not matter."""
+"""A short run with errors that show an order at coarse steps: cheaper than the default run."""
 
 
 def furuta(folder, changes=(), **fields):

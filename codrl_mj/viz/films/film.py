@@ -21,7 +21,7 @@ import numpy as np
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.physics.offscreen import OffscreenRenderer
-from codrl_mj.runs.files import writing, writing_folder
+from codrl_mj.runs.files import atomic_folder, atomic_write
 from codrl_mj.viz.films.strip import (
     AXIS_WIDTH,
     HEADER_HEIGHT,
@@ -301,13 +301,13 @@ def _encoding(
         options["output_params"] = [*h264]
     with contextlib.ExitStack() as stack:
         if out.suffix == "":
-            folder, counter = stack.enter_context(writing_folder(out)), itertools.count()
+            folder, counter = stack.enter_context(atomic_folder(out)), itertools.count()
 
             def write(frame: np.ndarray) -> None:
                 imageio.imwrite(folder / f"frame_{next(counter):05d}.png", frame)
 
         else:
-            temporary = stack.enter_context(writing(out))
+            temporary = stack.enter_context(atomic_write(out))
             write = stack.enter_context(imageio.get_writer(temporary, **options)).append_data
         executor = stack.enter_context(ThreadPoolExecutor(1))
         pending_writes: list[Future[None]] = []

@@ -160,7 +160,7 @@ def _plot_torque(episode: Episode, axes: Any) -> list[Any]:
             (desired, DESIRED, "desired", 1.0),
             (actual, ACTUAL, "actual", 2.0),
         )
-        if label == "actual" or all(episode.tracks)
+        if label == "actual" or all(episode.is_torque_controlled)
     ]
     limits = [name for name in _LIMIT_COLORS if name in episode.actuator.Signals._fields] or [
         "saturated"

@@ -7,7 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from codrl_mj.runs.files import check_writable, writing
+from codrl_mj.runs.files import atomic_write, check_writable
 from codrl_mj.validation.certificate import GROUPS, Certificate, verdict, versions
 from codrl_mj.validation.mutations import MutationResult, as_mapping, undetected_checks
 from codrl_mj.viz.pages import page
@@ -167,7 +167,10 @@ def write(
     # Build both texts before the files are opened, so that an error leaves the older pair in place.
     html_text = html(certificate, caught)
     check_writable(folder)
-    with writing(folder / JSON_NAME) as json_file, writing(folder / HTML_NAME) as html_file:
+    with (
+        atomic_write(folder / JSON_NAME) as json_file,
+        atomic_write(folder / HTML_NAME) as html_file,
+    ):
         json_file.write_text(text, encoding="utf-8")
         html_file.write_text(html_text, encoding="utf-8")
     return folder / JSON_NAME, folder / HTML_NAME

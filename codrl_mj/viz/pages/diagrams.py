@@ -18,17 +18,17 @@ from codrl_mj.actuators import (
     parameters_type,
 )
 from codrl_mj.sizing import (
+    CurrentLoopActuator,
     LoopDesign,
-    Looped,
     Response,
     abilities,
     closed_loop,
     design,
     open_loop,
-    small_step,
+    small_step_response,
 )
 from codrl_mj.sizing.abilities import diagram_limits, highest_current, torque_limits
-from codrl_mj.sizing.loop import Steps
+from codrl_mj.sizing.loop import StepResponses
 from codrl_mj.viz.pages.plots import Curve, Plot
 
 TORQUE_SPEED = "speed of the output [rad/s]", "torque of the output [N·m]"
@@ -36,7 +36,7 @@ TORQUE_SPEED = "speed of the output [rad/s]", "torque of the output [N·m]"
 _RECOVERY_SPAN, _CLOSE_UP_SPAN = (0.0, 60.0), (19.5, 24.0)
 """Time spans of a step out of saturation [ms]: the whole step, and a close-up."""
 
-Loops = Mapping[str, tuple[Looped, float | None]]
+Loops = Mapping[str, tuple[CurrentLoopActuator, float | None]]
 """Name of a current loop -> the loop, and the mechanical step [s] if it is not a drive's."""
 
 
@@ -47,7 +47,7 @@ def torque_speed_diagram(drive: Drive, numbers: Any = None, points: Any = None) 
 
     Args:
         drive: drive whose voltage, `max_current`, gear and friction are drawn.
-        numbers: `codrl_mj.catalogue.MotorNumbers`, for the continuous current; None if
+        numbers: `codrl_mj.catalogue.MotorParameters`, for the continuous current; None if
             it is unknown.
         points: operating points to draw too, shape (n, 2): speed [rad/s] and torque [N*m] of the
             output.
@@ -333,7 +333,7 @@ def small_step_plots(loops: Loops) -> list[Plot]:
     """
     curves = []
     for index, (name, loop) in enumerate(loops.items()):
-        step = small_step(*loop)
+        step = small_step_response(*loop)
         settled, reference = step.settling_time(), float(step.reference[-1])
         num_samples = max(int(3.0 * np.searchsorted(step.time, settled)), 20)
         step = Response(*(column[:num_samples] for column in step))
@@ -357,7 +357,7 @@ def small_step_plots(loops: Loops) -> list[Plot]:
     ]
 
 
-def recovery_plots(drive: Drive, steps: Steps) -> list[Plot]:
+def recovery_plots(drive: Drive, steps: StepResponses) -> list[Plot]:
     """Return the recovery from an unreachable reference for each anti-windup, and a close-up."""
     responses = {}
     for kind, response in steps.recoveries.items():
@@ -396,7 +396,7 @@ def _responses(
     ]
 
 
-def _voltages(loop: Looped, responses: Mapping[str, Response]) -> Plot:
+def _voltages(loop: CurrentLoopActuator, responses: Mapping[str, Response]) -> Plot:
     """Return the voltage of responses, with the limits of the supply."""
     color = None if len(responses) > 1 else 1
     curves = [
@@ -425,10 +425,15 @@ def torque_step_plot(steps: Mapping[str, tuple[ActuatorModel, float, float]]) ->
     curves = []
     for name, (actuator, desired, timestep) in steps.items():
         kind: Any = type(actuator)
-        if not actuator.tracks or actuator.MOTION or not kind.State._fields or desired == 0.0:
+        if (
+            not actuator.is_torque_controlled
+            or actuator.MOTION
+            or not kind.State._fields
+            or desired == 0.0
+        ):
             continue
         parameters, state = (
-            parameters_type(kind)(*actuator.numbers),
+            parameters_type(kind)(*actuator.parameter_values),
             kind.State(*[0.0] * len(kind.State._fields)),
         )
         share = [0.0]

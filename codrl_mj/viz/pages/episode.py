@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Ideal
 from codrl_mj.evaluation import run_episodes
-from codrl_mj.evaluation.evaluate import Driven, driven_in
+from codrl_mj.evaluation.evaluate import MotorTrace, motor_traces
 from codrl_mj.viz.films.film import Clip, clip, record
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.diagrams import episode_diagram
@@ -69,7 +69,7 @@ def run_and_film(name: str, env: Any, policy: Any, seed: int, with_film: bool = 
 
 
 @dataclasses.dataclass(frozen=True)
-class _MotorSeries(Driven):
+class _MotorSeries(MotorTrace):
     """Signals of one motor of one run, with the style of their curves."""
 
     label_prefix: str
@@ -205,7 +205,7 @@ def _motor_series(runs: Sequence[RunEpisode], motors: list[str]) -> list[_MotorS
     pairs = [
         (run, motor_index, motor)
         for run in runs
-        for motor_index, motor in enumerate(driven_in(run.episode))
+        for motor_index, motor in enumerate(motor_traces(run.episode))
     ]
     max_points = max(MAX_POINTS // 4, _MAX_EPISODE_POINTS // (10 * len(pairs)))
     # Both the points of each curve and those of the page are limited. All motors share a stride, so
@@ -245,7 +245,7 @@ def _motor_plots(lines: Sequence[_MotorSeries]) -> list[Plot]:
     torque, error, current, voltage, power, temperature = ([] for _ in range(6))  # type: ignore[var-annotated]
     for line in lines:
         torque.append(line.curve("actual", line.actual, 1))
-        if line.tracks:
+        if line.is_torque_controlled:
             torque.append(line.curve("desired", line.desired, 0, dashed=True))
             error.append(line.curve("desired less actual", line.desired - line.actual, 4))
         if line.has("current"):

@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Drive
 from codrl_mj.catalogue import MotorEntry
-from codrl_mj.sizing import LoopDesign, design, designs, explain, step, unknown_in_words
+from codrl_mj.sizing import LoopDesign, describe_unknown, design, designs, explain, step_responses
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.diagrams import (
     Loops,
@@ -134,7 +134,7 @@ def _abilities(explanation: Mapping[str, Any], drive: Drive, entry: MotorEntry |
     if explanation["assumed"]:
         table += page.paragraph(f"{explanation['assumed']}.", "soft")
     try:
-        plots = page.plots([torque_speed_diagram(drive, entry and entry.numbers)])
+        plots = page.plots([torque_speed_diagram(drive, entry and entry.parameters)])
     except ValueError as error:
         plots = page.note(str(error))
     return Markup('<div class="beside">{}{}</div>').format(plots, table)
@@ -146,7 +146,7 @@ def _loop(name: str, drive: Drive) -> Markup:
     try:
         parts += [
             page.heading("Out of saturation, by kind of anti-windup"),
-            page.plots(recovery_plots(drive, step(drive))),
+            page.plots(recovery_plots(drive, step_responses(drive))),
         ]
     except ValueError as error:
         parts = [parts[0], page.note(str(error))]
@@ -202,5 +202,5 @@ def _numbers(explanation: Mapping[str, Any]) -> Markup:
     if explanation["estimated"]:
         parts += [page.heading("Estimated"), page.definitions(explanation["estimated"].items())]
     if explanation["unknown"]:
-        parts.append(page.paragraph(unknown_in_words(explanation["unknown"]), "soft"))
+        parts.append(page.paragraph(describe_unknown(explanation["unknown"]), "soft"))
     return page.join(parts)

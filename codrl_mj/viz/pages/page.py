@@ -15,7 +15,7 @@ import jinja2
 from markupsafe import Markup
 
 from codrl_mj import __version__
-from codrl_mj.runs.files import check_page, writing
+from codrl_mj.runs.files import atomic_write, check_page
 from codrl_mj.viz.pages.plots import Plot, describe, to_json, to_svg
 
 _HERE = Path(__file__).parent
@@ -90,7 +90,7 @@ def page(title: str, kicker: str, top: Markup, sections: Sequence[Section]) -> s
 def write(path: Path, text: str) -> Path:
     """Write a page to an .html file, which is replaced only when the page is complete."""
     check_page(path)
-    with writing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
 

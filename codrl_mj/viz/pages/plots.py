@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 
 MAX_POINTS = 6000
 """Maximum number of points of a line: even a zoomed screen has fewer pixels."""
@@ -276,7 +276,7 @@ def save_png(
             fontsize="small",
             frameon=False,
         )
-    with writing(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=150)
 
 

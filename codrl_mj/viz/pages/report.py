@@ -12,19 +12,19 @@ from markupsafe import Markup
 from codrl_mj.actuators import ActuatorModel, DCMotorActuator, Drive, Ideal
 from codrl_mj.evaluation import Episode
 from codrl_mj.evaluation.evaluate import MEASURES
-from codrl_mj.runs import BEST, EPISODES, PROGRESS, finished, told_apart
+from codrl_mj.runs import BEST, EPISODES, PROGRESS, finished, unique_names
 from codrl_mj.runs.files import check_page, read_json
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.runs.summaries import (
     RunSummary,
     compare,
-    rank,
+    describe_rank,
+    median_seed,
     read_evaluation,
     read_reports,
     read_run,
-    typical_seed,
 )
-from codrl_mj.sizing import Looped, is_closed
+from codrl_mj.sizing import CurrentLoopActuator, is_closed
 from codrl_mj.training.folder import load_config
 from codrl_mj.training.history import learning_curves, read_episodes
 from codrl_mj.viz.pages import certificate as certificates
@@ -84,7 +84,7 @@ def report(
     reported = [
         _run_episode(summary, name, which, seed, trust, with_film, on_part)
         for summary, name in zip(
-            summaries, told_apart([summary.path for summary in summaries]), strict=True
+            summaries, unique_names([summary.path for summary in summaries]), strict=True
         )
     ]
     on_part("page")
@@ -129,7 +129,7 @@ def _run_episode(
     """Return a run with an episode, if it can be run."""
     best = which == "best" or not finished(summary.path)
     evaluation = read_evaluation(summary.path, best)
-    seed = seed_given if seed_given is not None else typical_seed(evaluation) or 0
+    seed = seed_given if seed_given is not None else median_seed(evaluation) or 0
     try:
         config = load_config(summary.path, trust)
     except (ValueError, OSError, ImportError) as error:
@@ -151,7 +151,7 @@ def _run_episode(
         on_part(f"{name}: episode")
         result = run_and_film(name, env, load_policy(policy, trust), seed, with_film)
         return result._replace(
-            best=best, summary=summary, rank=rank(evaluation, result.episode.total)
+            best=best, summary=summary, rank=describe_rank(evaluation, result.episode.total)
         )
     # Third-party environments and actuators may raise any error. The report names it and shows the
     # rest.
@@ -373,7 +373,7 @@ def replay_parts(runs: Sequence[RunEpisode]) -> list[Markup]:
 
 def _loop(runs: Sequence[RunEpisode]) -> Markup:
     """Return the different current loops, and torque steps of actuators without one."""
-    loops: dict[str, tuple[Looped, float | None]] = {}
+    loops: dict[str, tuple[CurrentLoopActuator, float | None]] = {}
     steps: dict[str, tuple[ActuatorModel, float, float]] = {}
     notes: dict[str, None] = {}
     known_loops: list[Any] = []

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj.evaluation.episodes import Episode
-from codrl_mj.runs.files import check_page, writing
+from codrl_mj.runs.files import atomic_write, check_page
 from codrl_mj.viz.replay.scene import (
     TRIANGLES,
     Shape,
@@ -196,7 +196,7 @@ def write_replay(content: Motion, path: Path, title: str) -> Path:
     filled = filled_start + "".join(
         entries[name] + after for name, after in (piece.split("}}", 1) for piece in pieces)
     )
-    with writing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(filled, encoding="utf-8")
     return path
 

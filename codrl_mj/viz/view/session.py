@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.actuators import actuator_over
+from codrl_mj.actuators import override_actuator
 from codrl_mj.evaluation import RandomPolicy
 from codrl_mj.fields import field_docs, parts
 
@@ -256,13 +256,13 @@ class Session:
         The motion continues, and the motor's state is reset.
         """
         for name in reversed(path):
-            # `actuator_over` takes nested mappings: turn the path into one, from the inside out.
+            # `override_actuator` takes nested mappings: turn the path into one, from the inside out.
             value = {name: value}
         self._rebuild(
             lambda: {
                 "actuator": {
                     **self.config.actuators_by_name,
-                    pattern: actuator_over(self.config.actuators_by_name[pattern], value),
+                    pattern: override_actuator(self.config.actuators_by_name[pattern], value),
                 }
             }
         )

@@ -1,4 +1,4 @@
-"""Arms and claims: the settings are the paper's, and a claim is confirmed where it is so, and not where it is not."""
+"""Arms and claims: the settings are the paper's, and a claim is confirmed exactly if it is true."""
 
 import dataclasses
 import types
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import IDEAL, CurrentLoop, Motor
-from codrl_mj.study.trials import numbers_as_text
+from codrl_mj.study.trials import format_ranges
 from codrl_mj.tasks import named_actuator
 from codrl_mj.training import TrainConfig
 from reproduction.arms import ARMS, TASKS
@@ -35,7 +35,7 @@ ARM = {arm.name: arm for arm in ARMS}
 
 
 @pytest.mark.parametrize("arm", ARMS, ids=ARM)
-def test_an_arm_is_trained_as_the_papers_settings_say(arm):
+def test_an_arm_has_the_paper_s_settings(arm):
     config = arm.training(7)
     preset = TrainConfig.preset(arm.task, config.agent.name, arm.settings, seed=7)
     assert (config.agent, config.seed, config.num_envs) == (preset.agent, 7, preset.num_envs)
@@ -56,8 +56,8 @@ def test_an_arm_is_trained_as_the_papers_settings_say(arm):
     assert arm.actuator == expected[arm.motor]
 
 
-def test_the_gains_are_those_that_the_paper_prints():
-    """Each experiment's caption in the paper; R = 1, L = 0.1, kT = 1 for all."""
+def test_the_gains_are_the_paper_s():
+    """Source: the caption of each experiment in the paper; R = 1, L = 0.1, kT = 1 for all."""
     printed = {
         ("pendulum", "paper gains"): (1, 20, 1e-6, 0, 1.0),
         ("mountain_car", "paper gains"): (1, 1, 1e-2, 0, 1.0),
@@ -76,7 +76,7 @@ def test_the_gains_are_those_that_the_paper_prints():
             )
 
 
-def test_budgets_are_the_papers():
+def test_budgets_are_the_paper_s():
     budgets = {arm.task: (arm.config.total_episodes, arm.config.total_steps) for arm in ARMS}
     assert budgets == {
         "pendulum": (500, None),
@@ -87,7 +87,7 @@ def test_budgets_are_the_papers():
     }
 
 
-def test_every_experiment_is_there_ideal_and_actuated():
+def test_every_experiment_has_ideal_and_actuated_arms():
     assert len(ARM) == len(ARMS)
     assert len(TASKS) == 5
     for task in TASKS:
@@ -99,14 +99,14 @@ def test_every_experiment_is_there_ideal_and_actuated():
     assert {arm.task for arm in ARMS if arm.physics == "analytic"} == {"mountain_car", "cartpole"}
 
 
-def test_trying_out_cuts_trainings_off_and_changes_nothing_else():
+def test_a_trial_run_only_shortens_trainings():
     for arm in ARMS:
         assert arm.cut_off(3) == dataclasses.replace(
             arm, config=dataclasses.replace(arm.config, total_episodes=3)
         )
 
 
-def test_every_claim_is_about_arms_that_there_are():
+def test_every_claim_refers_to_existing_arms():
     for claim in CLAIMS:
         assert {ARM[name].task for name in claim.arms} == {claim.task}
     of = [
@@ -136,18 +136,18 @@ def test_without_runs_no_claim_can_be_tested():
 
 
 def outcomes(rows, source):
-    """Outcome -> statements."""
-    found = {outcome: set() for outcome in OUTCOMES}
+    """Return outcome -> statements."""
+    statements = {outcome: set() for outcome in OUTCOMES}
     for claim in CLAIMS:
         if claim.source == source and claim.counted:
-            found[claim.judge(rows).outcome].add((claim.task, claim.statement))
-    return found
+            statements[claim.judge(rows).outcome].add((claim.task, claim.statement))
+    return statements
 
 
-def test_where_the_paper_is_right_what_it_read_off_one_run_is_compatible_and_all_else_is_confirmed():
-    found = outcomes(world(PAPERS), PAPER_SAYS)
-    assert found[NOT_CONFIRMED] == found[NOT_TESTABLE] == found[OPEN] == set()
-    assert found[COMPATIBLE] == {
+def test_true_claims_are_confirmed_or_for_single_runs_compatible():
+    statements = outcomes(world(PAPERS), PAPER_SAYS)
+    assert statements[NOT_CONFIRMED] == statements[NOT_TESTABLE] == statements[OPEN] == set()
+    assert statements[COMPATIBLE] == {
         ("mountain_car", "return, last 50"),
         ("mountain_car", "goal"),
         ("mountain_car", "goal, gains 2, 10, 1e-6"),
@@ -161,7 +161,7 @@ def test_where_the_paper_is_right_what_it_read_off_one_run_is_compatible_and_all
     assert outcomes(world(PAPERS), PORT)[CONFIRMED]
 
 
-def test_where_the_paper_is_not_right_its_claims_are_not_confirmed():
+def test_false_claims_are_not_confirmed():
     refuted = outcomes(world(OTHERS), PAPER_SAYS)[NOT_CONFIRMED]
     assert refuted == {
         ("mountain_car", "return, last 50"),
@@ -187,18 +187,18 @@ def test_both_kinds_of_physics_are_compared_seed_by_seed():
         if claim.source == PORT and claim.task == "cartpole" and "ideal" in claim.arms[0]
     ]
     assert claim.judge(rows).reason == "no two values differ"
-    mine, other = (rows[name] for name in claim.arms)
-    shifted = [row | {"last_50": str(float(row["last_50"]) - 300)} for row in other]
+    mujoco_rows, other_rows = (rows[name] for name in claim.arms)
+    shifted = [row | {"last_50": str(float(row["last_50"]) - 300)} for row in other_rows]
     assert claim.judge(rows | {claim.arms[1]: shifted}).outcome == NOT_CONFIRMED
     assert claim.judge(rows | {claim.arms[1]: shifted[4:]}).outcome == NOT_TESTABLE
     again = [
-        *mine,
-        mine[0] | {"run": "another", "last_50": "7"},
+        *mujoco_rows,
+        mujoco_rows[0] | {"run": "another", "last_50": "7"},
     ]  # of a seed trained twice the first is the pair's
     assert claim.judge(rows | {claim.arms[0]: again}).reason == "no two values differ"
 
 
-# -- rows ---------------------------------------------------------------------------------------------------
+# -- rows ------------------------------------------------------------------------------------------
 
 
 def test_the_last_episodes_are_counted_from_the_end():
@@ -210,12 +210,12 @@ def test_the_last_episodes_are_counted_from_the_end():
     assert times_of(row["times"]).tolist() == [1.5, np.inf]
 
 
-def test_a_training_replaces_its_own_row_and_stands_beside_one_with_other_packages():
+def test_a_row_is_replaced_by_its_training_but_not_by_one_with_other_packages():
     arm = ARM["acrobot, paper, ideal, mujoco"]
     row = made_up(arm)
-    same, other = row | {"run": "renamed"}, row | {"run": "renamed", "returns": "7"}
-    assert joined([row], same) == [same]
-    assert joined([row], other) == [row, other]
+    same_row, other_row = row | {"run": "renamed"}, row | {"run": "renamed", "returns": "7"}
+    assert joined([row], same_row) == [same_row]
+    assert joined([row], other_row) == [row, other_row]
     assert complete([row], {"times", "returns"})
     assert not complete([row | {"times": ""}], {"times", "returns"})
 
@@ -223,16 +223,16 @@ def test_a_training_replaces_its_own_row_and_stands_beside_one_with_other_packag
 @pytest.mark.parametrize(
     ("angle", "speed", "since"), [(0.19, 0.29, 0.0), (0.21, 0.0, None), (0.0, 0.31, None)]
 )
-def test_upright_is_what_full_torque_can_hold(angle, speed, since):
-    """It just holds the rod at asin(2/5), of which 0.2 rad is half, and changes its speed by 0.3 rad/s in a step."""
+def test_upright_is_defined_by_full_torque(angle, speed, since):
+    """Full torque holds the rod at asin(2/5) = 2*0.2 rad and adds 0.3 rad/s in a step."""
     assert pytest.approx(np.arcsin(2 / 5) / 2, abs=0.01) == UPRIGHT_ANGLE
     assert pytest.approx(0.3) == UPRIGHT_SPEED
     time = 0.05 * np.arange(1, 201)
     state = np.tile([angle, speed], (201, 1))
     assert upright_since(types.SimpleNamespace(time=time, state=state)) == since
     late = np.where(np.arange(201)[:, None] < 180, [[3.0, 0.0]], [[0.0, 0.0]])
-    found = upright_since(types.SimpleNamespace(time=time, state=late))
-    assert found == pytest.approx(9.0)
+    time_upright = upright_since(types.SimpleNamespace(time=time, state=late))
+    assert time_upright == pytest.approx(9.0)
     late[-1] = 3.0
     assert upright_since(types.SimpleNamespace(time=time, state=late)) is None
 
@@ -247,12 +247,12 @@ def test_episodes_are_sorted_into_the_epochs_in_which_they_end():
 
 
 @pytest.mark.parametrize(("epoch", "first"), [(33, 33), (61, 61)])
-def test_a_level_that_is_never_reached_counts_as_one_epoch_more_than_there_are(epoch, first):
+def test_a_level_that_is_never_reached_counts_as_the_last_epoch_plus_one(epoch, first):
     epochs = epochs_of(ARM["cartpole, paper, ideal, mujoco"], trained(3, epoch=epoch - 1))  # of 60
     assert reached(epochs.lengths >= 4000) == first
 
 
-def test_the_running_mean_is_over_what_there_is():
+def test_the_running_mean_uses_the_available_values():
     values = np.arange(1.0, 8.0)
     expected = [values[max(0, end - 3) : end].mean() for end in range(1, 8)]
     assert running_mean(np.array([values, 2 * values]), 3) == pytest.approx(
@@ -260,14 +260,14 @@ def test_the_running_mean_is_over_what_there_is():
     )
 
 
-def test_the_band_is_the_bootstraps():
-    """Two values a and b: a quarter of the resamples has the mean a, a quarter b: the 95 % interval is from a to b."""
+def test_the_band_is_a_bootstrap_interval():
+    """A quarter of the resamples of two values a and b has the mean a, and a quarter b."""
     mean, low, high = band(np.array([[0.0, 1.0], [4.0, 1.0]]))
     assert (mean.tolist(), low.tolist(), high.tolist()) == ([2.0, 1.0], [0.0, 1.0], [4.0, 1.0])
-    alone = band(np.array([[3.0, 4.0]]))
-    assert [bound.tolist() for bound in alone] == [[3.0, 4.0]] * 3
+    single_seed = band(np.array([[3.0, 4.0]]))
+    assert [bound.tolist() for bound in single_seed] == [[3.0, 4.0]] * 3
 
 
 def test_seeds_as_text():
-    assert numbers_as_text([7, 1, 0, 2, 5, 6, 9]) == "0 to 2, 5 to 7, 9"
-    assert numbers_as_text([]) == ""
+    assert format_ranges([7, 1, 0, 2, 5, 6, 9]) == "0 to 2, 5 to 7, 9"
+    assert format_ranges([]) == ""

@@ -1,4 +1,4 @@
-"""The reproduction from configuration to page: tiny trainings, what is missing, what failed, figures, command line."""
+"""The reproduction: short trainings, gaps, failures, page, figures, command line."""
 
 import contextlib
 import csv
@@ -47,8 +47,8 @@ BLOCKED = HILL[-1]
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory):
-    """One of two seeds of mountain cars that were trained for two episodes; one arm could not be."""
+def reproduction(tmp_path_factory):
+    """Return a finished reproduction with one of two seeds of mountain cars and a failed arm."""
     root = tmp_path_factory.mktemp("paper")
     plan = Reproduction(
         root=root,
@@ -69,8 +69,8 @@ def done(tmp_path_factory):
 
 
 @pytest.mark.matrix
-def test_every_arm_is_trained_tested_and_read(done):
-    plan, findings, _, _, reported = done
+def test_every_arm_is_trained_tested_and_read(reproduction):
+    plan, findings, _, _, reported = reproduction
     assert (reported.count("training"), reported.count("test")) == (6, 5)
     for arm in HILL[:-1]:
         (row,) = findings.runs[arm.name]
@@ -78,13 +78,13 @@ def test_every_arm_is_trained_tested_and_read(done):
         assert (row["seed"], row["run"]) == ("0", folder.name)
         expected = evaluate(load_policy(folder), arm.config.evaluation_env, 3, EVALUATION_SEED)
         assert float(row["returns"]) == expected.returns.mean
-        assert row["time_to_goal"] == ""  # nobody arrives after two episodes
+        assert row["time_to_goal"] == ""  # No policy arrives after two training episodes.
         assert row["times"] == "- - -"
 
 
 @pytest.mark.matrix
-def test_what_failed_or_was_not_tried_is_said(done):
-    _, findings, out, _, _ = done
+def test_failed_and_missing_trainings_are_reported(reproduction):
+    _, findings, out, _, _ = reproduction
     assert findings.missing[BLOCKED.name] == [0, 1]
     assert "is not a folder" in findings.failures[f"{BLOCKED.name}, seed 0"]
     page = (out / PAGE).read_text()
@@ -96,8 +96,8 @@ def test_what_failed_or_was_not_tried_is_said(done):
 
 
 @pytest.mark.matrix
-def test_the_page_has_every_statement_once_and_the_table_every_claim_with_its_check(done):
-    _, findings, out, _, _ = done
+def test_the_page_has_every_statement_once_and_the_table_every_claim_with_its_check(reproduction):
+    _, findings, out, _, _ = reproduction
     page = (out / PAGE).read_text()
     rows = list(csv.DictReader((out / FOLDER / "claims.csv").open(newline="", encoding="utf-8")))
     judged = [
@@ -120,20 +120,20 @@ def test_the_page_has_every_statement_once_and_the_table_every_claim_with_its_ch
 
 
 def pretended(outcome=None, rows=None):
-    """What is found where every claim comes to the same, or to what rows say."""
+    """Return findings in which every claim has the same outcome, or that follow from rows."""
     runs = rows or {arm.name: [] for arm in ARMS}
     verdicts = [(claim, Verdict(outcome, "") if outcome else claim.judge(runs)) for claim in CLAIMS]
     return types.SimpleNamespace(runs=runs, verdicts=verdicts)
 
 
-def test_22_statements_are_counted_whatever_they_come_to():
+def test_22_statements_are_counted_for_any_outcome():
     assert "**Of 22 statements: 22 open.**" in verdicts_line(pretended(OPEN).verdicts)
     table = statements_table(pretended(CONFIRMED)).splitlines()
     assert len(table) == 2 + 22
     assert all(line.endswith("**confirmed** |") for line in table[2:])
 
 
-def test_what_settings_as_printed_come_to_stands_beside_what_counts():
+def test_results_of_settings_as_printed_are_shown_in_addition():
     table = statements_table(pretended(rows=world(PAPERS)))
     assert "| goal, no motor |  | 160 s |  |  | 160.0 s" in table.replace("160 s [", "160.0 s [")
     line = next(line for line in table.splitlines() if "*Continuous Mountain Car*" in line)
@@ -145,18 +145,18 @@ def test_what_settings_as_printed_come_to_stands_beside_what_counts():
 
 
 def test_p_is_corrected_for_all_comparisons_of_a_source():
-    """Holm: the smallest of n by n."""
+    """Holm multiplies the smallest of n p by n."""
     rows = claim_rows(pretended(rows=world(PAPERS)).verdicts)
     compared = [row for row in rows if row["p"] is not None and row["source"] == PAPER_SAYS]
     assert len(compared) == 5
-    least = min(compared, key=lambda row: row["p"])
-    assert least["p_corrected"] == pytest.approx(5 * least["p"])
+    smallest = min(compared, key=lambda row: row["p"])
+    assert smallest["p_corrected"] == pytest.approx(5 * smallest["p"])
     assert all(row["p_corrected"] is None for row in rows if row["p"] is None)
 
 
 @pytest.mark.matrix
-def test_every_file_that_the_page_names_is_there_and_whole(done):
-    _, _, out, files, _ = done
+def test_every_file_named_on_the_page_is_complete(reproduction):
+    _, _, out, files, _ = reproduction
     page = (out / PAGE).read_text()
     named = {out / name for name in re.findall(rf"\(({FOLDER}/[^)]+)\)", page)}
     assert named | {out / PAGE, out / FOLDER / STATES, out / FOLDER / TORQUES} == set(files)
@@ -173,8 +173,8 @@ def test_every_file_that_the_page_names_is_there_and_whole(done):
 
 
 @pytest.mark.matrix
-def test_the_tables_are_the_findings(done):
-    _, findings, out, _, _ = done
+def test_the_tables_contain_the_findings(reproduction):
+    _, findings, out, _, _ = reproduction
     runs = list(csv.DictReader((out / FOLDER / "runs.csv").open()))
     assert runs == [row for rows in findings.runs.values() for row in rows]
     claims = list(csv.DictReader((out / FOLDER / "claims.csv").open()))
@@ -183,7 +183,13 @@ def test_the_tables_are_the_findings(done):
     ]
     content = json.loads((out / FOLDER / "findings.json").read_text())
     assert content["missing"][BLOCKED.name] == [0, 1]
-    assert [one["discount"] for one in content["value_iteration"]] == [0.85, 0.9, 0.95, 0.99, 0.999]
+    assert [entry["discount"] for entry in content["value_iteration"]] == [
+        0.85,
+        0.9,
+        0.95,
+        0.99,
+        0.999,
+    ]
     curves = list(csv.DictReader((out / FOLDER / CURVES).open()))
     assert {(row["motor"], row["seeds"]) for row in curves} == {
         ("paper gains", "1"),
@@ -193,37 +199,37 @@ def test_the_tables_are_the_findings(done):
 
 
 @pytest.mark.matrix
-def test_rows_are_published_as_they_finish_and_stand_for_run_folders_that_are_gone(done, tmp_path):
-    """Once without folders, and once with none of its rows: both are the same page."""
-    plan, _, out, _, _ = done
+def test_published_rows_replace_deleted_run_folders(reproduction, tmp_path):
+    """The page is the same without run folders and without published rows."""
+    plan, _, out, _, _ = reproduction
     elsewhere = dataclasses.replace(plan, out=tmp_path)
     elsewhere.publish()
     assert (tmp_path / FOLDER / "runs.csv").read_bytes() == (out / FOLDER / "runs.csv").read_bytes()
     shutil.copytree(out / FOLDER, tmp_path / "gone" / FOLDER)
     gone = dataclasses.replace(plan, root=tmp_path / "none", out=tmp_path / "gone")
     for path in write(gone.findings(), gone.out):
-        other = out / path.relative_to(gone.out)
+        original = out / path.relative_to(gone.out)
         if path.suffix in (".csv", ".svg"):
-            assert path.read_bytes() == other.read_bytes(), path
-    left = {cost.arm.name: cost.missing for cost in gone.grid.costs()}
-    assert left[HILL[0].name] == (1,)
-    assert left[BLOCKED.name] == (0, 1)
+            assert path.read_bytes() == original.read_bytes(), path
+    missing_seeds = {cost.arm.name: cost.missing for cost in gone.grid.costs()}
+    assert missing_seeds[HILL[0].name] == (1,)
+    assert missing_seeds[BLOCKED.name] == (0, 1)
 
 
 @pytest.mark.matrix
-def test_written_again_from_the_run_folders_it_is_the_same(done, tmp_path):
-    plan, _, out, files, _ = done
+def test_writing_again_from_the_run_folders_gives_the_same_files(reproduction, tmp_path):
+    plan, _, out, files, _ = reproduction
     again = write(dataclasses.replace(plan, out=tmp_path).findings(), tmp_path)
     assert [path.relative_to(tmp_path) for path in again] == [
         path.relative_to(out) for path in files
     ]
-    for path, other in zip(files, again, strict=True):
-        assert path.read_bytes() == other.read_bytes(), path
+    for path, original in zip(files, again, strict=True):
+        assert path.read_bytes() == original.read_bytes(), path
 
 
 @pytest.mark.matrix
-def test_the_page_includes_what_a_person_wrote(done, tmp_path):
-    plan, _, _, _, _ = done
+def test_the_page_includes_written_conclusions(reproduction, tmp_path):
+    plan, _, _, _, _ = reproduction
     written = tmp_path / "reproduction_conclusions.md"
     written.write_text("What a person wrote.\n")
     write(dataclasses.replace(plan, tasks=("acrobot",), out=tmp_path).findings(), tmp_path)
@@ -232,8 +238,8 @@ def test_the_page_includes_what_a_person_wrote(done, tmp_path):
 
 
 @pytest.mark.matrix
-def test_the_published_page_is_what_the_published_rows_say(tmp_path):
-    """Byte for byte, with its tables and figures, from rows, curves and episodes."""
+def test_the_published_page_follows_from_the_published_rows(tmp_path):
+    """Compare page, tables and figures byte for byte, from rows, curves and episodes."""
     shutil.copytree(RESULTS / FOLDER, tmp_path / FOLDER)
     shutil.copy(RESULTS / "reproduction_conclusions.md", tmp_path)
     (tmp_path / FOLDER / "claims.csv").unlink()
@@ -250,8 +256,8 @@ def test_the_published_page_is_what_the_published_rows_say(tmp_path):
             )
 
 
-def test_a_stranger_recomputes_every_verdict_without_the_package():
-    """In an interpreter that has nothing of ours."""
+def test_the_example_recomputes_every_verdict_without_the_package():
+    """Run in an interpreter without the package."""
     example = RESULTS.parents[1] / "examples" / "recompute_reproduction.py"
     run = [sys.executable, "-I", "-S", str(example), str(RESULTS / FOLDER)]
     lines = subprocess.run(run, capture_output=True, text=True, check=True).stdout.splitlines()
@@ -262,11 +268,11 @@ def test_a_stranger_recomputes_every_verdict_without_the_package():
     assert len(claims) == len(CLAIMS)
 
 
-def test_published_verdicts_are_of_the_claims_as_they_are():
+def test_published_verdicts_follow_from_the_current_claims():
     rows = read_rows(RESULTS / FOLDER)
     runs = {arm.name: [] for arm in ARMS}
-    for of, found in rows.items():
-        runs[", ".join(of[:-1])] += found
+    for key, arm_rows in rows.items():
+        runs[", ".join(key[:-1])] += arm_rows
     claims = list(
         csv.DictReader((RESULTS / FOLDER / "claims.csv").open(newline="", encoding="utf-8"))
     )
@@ -275,8 +281,8 @@ def test_published_verdicts_are_of_the_claims_as_they_are():
 
 
 @pytest.mark.matrix
-def test_finished_runs_are_not_trained_again(done):
-    plan, _, _, _, _ = done
+def test_finished_runs_are_not_trained_again(reproduction):
+    plan, _, _, _, _ = reproduction
     hill = dataclasses.replace(plan, tasks=("mountain_car",), sarsa_seeds=1)
     results = [
         folder / "result.json"
@@ -290,14 +296,14 @@ def test_finished_runs_are_not_trained_again(done):
 
 
 @pytest.mark.matrix
-def test_costs_are_those_of_finished_runs_or_estimates(done):
-    plan, findings, _, _, _ = done
+def test_costs_come_from_finished_runs_or_estimates(reproduction):
+    plan, findings, _, _, _ = reproduction
     by_arm = {cost.arm.name: cost for cost in plan.grid.costs()}
-    half = by_arm[HILL[0].name]  # the first seed's row is published
+    half = by_arm[HILL[0].name]  # The first seed's row is published.
     assert (half.finished, half.missing) == ((), (1,))
-    assert (half.tests, half.left) == (1, HILL[0].seconds + TEST_SECONDS)
+    assert (half.tests, half.remaining_seconds) == (1, HILL[0].seconds + TEST_SECONDS)
     none = by_arm[BLOCKED.name]
-    assert (none.finished, none.missing, none.left) == (
+    assert (none.finished, none.missing, none.remaining_seconds) == (
         (),
         (0, 1),
         2 * (BLOCKED.seconds + TEST_SECONDS),
@@ -306,13 +312,13 @@ def test_costs_are_those_of_finished_runs_or_estimates(done):
     assert took[HILL[0].name] == float(findings.runs[HILL[0].name][0]["seconds"])
 
 
-def test_the_whole_is_estimated_at_less_than_four_hours_of_two_cores(tmp_path):
+def test_the_estimate_is_less_than_four_hours_on_two_cores(tmp_path):
     grid = Reproduction(root=tmp_path, out=tmp_path).grid
-    assert sum(cost.left for cost in grid.costs()) < 2 * 4 * 3600
+    assert sum(cost.remaining_seconds for cost in grid.costs()) < 2 * 4 * 3600
     assert len(grid.cells) == sum(30 if arm.task == "mountain_car" else 5 for arm in ARMS)
 
 
-def test_all_arms_first_seeds_are_trained_first_and_the_longest_before_the_others(tmp_path):
+def test_first_seeds_are_trained_first_and_long_trainings_before_short_ones(tmp_path):
     order = list(Reproduction(root=tmp_path, out=tmp_path).grid.cells)
     seeds = [seed for _, seed in order]
     assert seeds == sorted(seeds)
@@ -321,7 +327,7 @@ def test_all_arms_first_seeds_are_trained_first_and_the_longest_before_the_other
     assert first == sorted(first, reverse=True)
 
 
-def test_as_many_seeds_are_trained_at_once_as_occupy_every_core(tmp_path, monkeypatch):
+def test_seeds_are_trained_together_until_every_core_is_occupied(tmp_path, monkeypatch):
     at_once = []
     monkeypatch.setattr(
         trials,
@@ -341,7 +347,7 @@ def test_as_many_seeds_are_trained_at_once_as_occupy_every_core(tmp_path, monkey
     ("changes", "message"),
     [
         ({"tasks": ("cartpol",)}, "unknown 'cartpol': did you mean 'cartpole'"),
-        ({"tasks": ()}, "none is named"),
+        ({"tasks": ()}, "empty"),
         ({"settings": ("repared",)}, "did you mean 'repaired'"),
         ({"seeds": 0}, "seeds = 0: must be an integer >= 1"),
         ({"sarsa_seeds": 1.5}, "sarsa_seeds = 1.5"),
@@ -349,16 +355,16 @@ def test_as_many_seeds_are_trained_at_once_as_occupy_every_core(tmp_path, monkey
         ({"test_episodes": None}, "test_episodes = None"),
     ],
 )
-def test_impossible_plans_are_refused(changes, message):
+def test_raises_if_the_plan_is_invalid(changes, message):
     with pytest.raises(ValueError, match=message):
         Reproduction(**changes)
 
 
-# -- figures ------------------------------------------------------------------------------------------------
+# -- figures ---------------------------------------------------------------------------------------
 
 
-def made_up(arm, steps=30, inner_steps=3):
-    """An episode of random numbers."""
+def random_episode(arm, steps=30, inner_steps=3):
+    """Return an episode of random numbers."""
     random = np.random.default_rng(0)
     task = find_task(arm.task)
     return Episode(
@@ -379,11 +385,14 @@ def made_up(arm, steps=30, inner_steps=3):
 
 
 @pytest.mark.parametrize("task", matrix_params(REPRESENTATIVES, TASKS))
-def test_states_and_torques_are_drawn_of_every_task(task, tmp_path):
+def test_states_and_torques_of_every_task_are_drawn(task, tmp_path):
     arms = [arm for arm in ARMS if arm.task == task and arm.physics == "mujoco"]
-    states = [row for arm in arms for row in state_rows(arm, made_up(arm))]
+    states = [row for arm in arms for row in state_rows(arm, random_episode(arm))]
     torques = [
-        row for arm in arms if arm.actuator != IDEAL for row in torque_rows(arm, made_up(arm))
+        row
+        for arm in arms
+        if arm.actuator != IDEAL
+        for row in torque_rows(arm, random_episode(arm))
     ]
     assert figures.draw_states(tmp_path / "states.svg", task, states)
     assert figures.draw_torque(tmp_path / "torque.svg", task, torques)
@@ -393,11 +402,11 @@ def test_states_and_torques_are_drawn_of_every_task(task, tmp_path):
     assert not (tmp_path / "none.svg").exists()
 
 
-def test_of_a_torque_a_second_or_twenty_steps_are_shown():
+def test_the_torque_figure_shows_a_second_or_twenty_steps():
     ends = {}
     for arm in ARMS:
         if arm.actuator != IDEAL:
-            rows = torque_rows(arm, made_up(arm, steps=80, inner_steps=2))
+            rows = torque_rows(arm, random_episode(arm, steps=80, inner_steps=2))
             ends[arm.task] = float(rows[-1]["time"]) + find_task(arm.task).step_duration / 2
     expected = {
         "pendulum": 1.0,
@@ -409,7 +418,7 @@ def test_of_a_torque_a_second_or_twenty_steps_are_shown():
     assert ends == pytest.approx(expected)
 
 
-def test_the_curves_are_what_the_paper_plots():
+def test_the_curves_are_the_quantities_in_the_paper_s_figures():
     """Acrobot hanging: -2; upright: 2. Pendulum upright: x = 1, y = 0."""
     height, *_ = figures.CURVES["acrobot"]
     states = np.array([[0, 0, 0, 0], [np.pi, 0, 0, 0], [np.pi / 2, np.pi / 2, 0, 0]])
@@ -423,7 +432,7 @@ def test_the_curves_are_what_the_paper_plots():
     assert speed.tolist() == [3.0, 0.0]
 
 
-def test_epochs_are_drawn_below_one_another(tmp_path):
+def test_epochs_are_drawn_one_below_the_other(tmp_path):
     arms = [arm for arm in ARMS if arm.task == "cartpole" and arm.physics == "mujoco"]
     rows = [
         row for arm in arms for row in curve_rows(arm, {seed: trained(seed) for seed in range(3)})
@@ -435,13 +444,22 @@ def test_epochs_are_drawn_below_one_another(tmp_path):
     assert ElementTree.parse(tmp_path / "epochs.svg").getroot().tag.endswith("svg")
 
 
-# -- command line -------------------------------------------------------------------------------------------
+# -- command line ----------------------------------------------------------------------------------
 
 
-def test_a_dry_run_lists_and_makes_nothing(tmp_path, capsys):
-    given = ["acrobot", "--dry-run", "--seeds", "3", "--jobs", "2", "--root", str(tmp_path / "no")]
-    given += ["--out", str(tmp_path / "out")]
-    assert main(Reproduction, given) == 0
+def test_a_dry_run_only_lists(tmp_path, capsys):
+    arguments = [
+        "acrobot",
+        "--dry-run",
+        "--seeds",
+        "3",
+        "--jobs",
+        "2",
+        "--root",
+        str(tmp_path / "no"),
+    ]
+    arguments += ["--out", str(tmp_path / "out")]
+    assert main(Reproduction, arguments) == 0
     shown = capsys.readouterr().out
     assert "acrobot, paper, paper gains, mujoco" in shown
     assert "0 to 2" in shown
@@ -449,8 +467,8 @@ def test_a_dry_run_lists_and_makes_nothing(tmp_path, capsys):
     assert not (tmp_path / "no").exists()
 
 
-def test_a_page_can_be_written_of_nothing(tmp_path, capsys):
-    given = [
+def test_a_page_can_be_written_without_results(tmp_path, capsys):
+    arguments = [
         "acrobot",
         "--only-page",
         "--root",
@@ -458,19 +476,20 @@ def test_a_page_can_be_written_of_nothing(tmp_path, capsys):
         "--out",
         str(tmp_path / "out"),
     ]
-    assert main(Reproduction, given) == 0
+    assert main(Reproduction, arguments) == 0
     assert "\n0 trainings, " in (tmp_path / "out" / PAGE).read_text()
     assert "not testable" in capsys.readouterr().out
     assert not (tmp_path / "no").exists()
 
 
 @pytest.mark.matrix
-def test_failures_show_in_the_exit_status(done, tmp_path, capsys):
-    plan, _, _, _, _ = done
-    given = ["mountain_car", "--only-page", "--root", str(plan.root), "--out", str(tmp_path)]
+def test_failures_set_the_exit_status(reproduction, tmp_path, capsys):
+    plan, _, _, _, _ = reproduction
+    arguments = ["mountain_car", "--only-page", "--root", str(plan.root), "--out", str(tmp_path)]
     assert (
         main(
-            Reproduction, [*given, "--sarsa-seeds", "2", "--episodes", "2", "--test-episodes", "3"]
+            Reproduction,
+            [*arguments, "--sarsa-seeds", "2", "--episodes", "2", "--test-episodes", "3"],
         )
         == 1
     )
@@ -478,8 +497,8 @@ def test_failures_show_in_the_exit_status(done, tmp_path, capsys):
 
 
 @pytest.mark.matrix
-def test_a_test_that_failed_is_said(done, tmp_path):
-    plan, _, _, _, _ = done
+def test_a_failed_test_is_reported(reproduction, tmp_path):
+    plan, _, _, _, _ = reproduction
     folder = plan.every.folders[HILL[0].name, 0]
     broken, content = folder / "policy.json", (folder / "policy.json").read_text()
     shorter = dataclasses.replace(plan, tasks=("mountain_car",), test_episodes=2)
@@ -494,7 +513,7 @@ def test_a_test_that_failed_is_said(done, tmp_path):
     assert "0" in {row["seed"] for row in findings.runs[HILL[1].name]}
 
 
-def test_an_unknown_task_is_named(capsys):
+def test_raises_if_a_task_is_unknown(capsys):
     with contextlib.suppress(SystemExit):
         assert main(Reproduction, ["pendulm", "--dry-run"]) == 2
     assert "did you mean 'pendulum'" in " ".join(capsys.readouterr().err.split())

@@ -1,4 +1,4 @@
-"""Value iteration: a chain with a closed form, Gymnasium's own environment, and what is known of the mountain car."""
+"""Value iteration, against a chain's closed form and Gymnasium's mountain car."""
 
 import gymnasium
 import numpy as np
@@ -16,8 +16,11 @@ def model():
 
 
 @pytest.mark.parametrize("discount", [0.0, 0.5, 0.99])
-def test_a_chain_is_worth_its_closed_form(discount):
-    """Stay for nothing, or step forward for -c; the n-th step earns 1: g^(n-1) - c (1 - g^n)/(1 - g) at discount g."""
+def test_the_values_of_a_chain_agree_with_the_closed_form(discount):
+    """Actions are to stay for 0 or to step forward for -c; the n-th step earns 1.
+
+    The value is g^(n-1) - c (1 - g^n)/(1 - g) at discount g.
+    """
     length, cost = 5, 0.1
     stay = sparse.eye_array(length)
     step = sparse.csr_array(np.diag(np.ones(length - 1), 1))  # the last one ends the episode
@@ -30,7 +33,7 @@ def test_a_chain_is_worth_its_closed_form(discount):
 
 
 @pytest.mark.parametrize("discount", [1.0, -0.1])
-def test_a_discount_that_does_not_converge_is_refused(discount):
+def test_raises_if_the_discount_does_not_converge(discount):
     with pytest.raises(ValueError, match=f"discount = {discount}: must be from 0 to below 1"):
         iterate(np.zeros((1, 1)), sparse.eye_array(1), discount)
 
@@ -38,12 +41,12 @@ def test_a_discount_that_does_not_converge_is_refused(discount):
 @pytest.mark.parametrize(
     ("field", "value"), [("positions", 1), ("speeds", 0), ("forces", 4), ("forces", 1)]
 )
-def test_impossible_grids_are_refused(field, value):
+def test_raises_if_the_grid_is_invalid(field, value):
     with pytest.raises(ValueError, match=f"Mesh.{field} = {value}: must be"):
         Mesh(**{field: value})
 
 
-def test_interpolation_is_exact_for_what_is_bilinear():
+def test_interpolation_is_exact_for_bilinear_functions():
     grid = Mesh(7, 5, 3)
     positions, speeds = np.meshgrid(*grid.axes, indexing="ij")
 
@@ -59,7 +62,7 @@ def test_interpolation_is_exact_for_what_is_bilinear():
     assert weights.sum(axis=1) == pytest.approx(1.0)
 
 
-def test_the_model_is_gymnasiums_own_step(model):
+def test_the_model_agrees_with_gymnasium_s_step(model):
     """The oracle rounds its state to float32."""
     env = gymnasium.make("MountainCarContinuous-v0", disable_env_checker=True).unwrapped
     random = np.random.default_rng(0)
@@ -87,7 +90,7 @@ def test_at_the_papers_discount_factor_standing_still_is_optimal(model):
     assert (still.returns.mean, still.success, still.steps) == (0.0, 0.0, None)
 
 
-def test_at_a_larger_one_the_car_drives_and_earns_what_solves_the_task(model):
+def test_at_a_larger_discount_factor_the_car_solves_the_task(model):
     driving = optimum(model, 0.99, episodes=5)
     assert not driving.stands_still
     assert driving.success == 1.0

@@ -27,16 +27,18 @@ from reproduction.checks import (
 NOTHING = np.array([])
 
 
-def test_the_prediction_interval_of_two_values_is_the_cauchy_distributions():
+def test_the_prediction_interval_of_two_values_is_cauchy_s():
     """With one degree of freedom Student's t is Cauchy's, whose quantiles are tangents."""
     reach = math.tan(math.pi * 0.475) * math.sqrt(2) * math.sqrt(1.5)
     assert prediction_interval(np.array([4.0, 6.0])) == pytest.approx((5 - reach, 5 + reach))
 
 
-def test_the_prediction_interval_covers_the_next_value_as_often_as_it_says():
+def test_the_prediction_interval_has_its_nominal_coverage():
     values = np.random.default_rng(0).normal(3.0, 2.0, (4000, 6))
     inside = [
-        low <= one[5] <= high for one in values for low, high in [prediction_interval(one[:5])]
+        low <= sample[5] <= high
+        for sample in values
+        for low, high in [prediction_interval(sample[:5])]
     ]
     assert np.mean(inside) == pytest.approx(0.95, abs=3 * math.sqrt(0.95 * 0.05 / 4000))
 
@@ -70,13 +72,13 @@ def test_values_without_spread_have_a_difference_without_spread(others, measured
 
 
 def test_a_means_interval_is_students():
-    """Of two values: with one degree of freedom Student's t is Cauchy's."""
+    """With two values, so one degree of freedom, Student's t is Cauchy's distribution."""
     reach = math.tan(math.pi * 0.475)
     assert mean_interval(np.array([4.0, 6.0])) == pytest.approx((5.0, 5 - reach, 5 + reach))
     assert mean_interval(np.array([4.0])) == (4.0, 4.0, 4.0)
 
 
-def test_the_central_range_leaves_out_a_fortieth_at_both_ends():
+def test_the_central_range_omits_a_fortieth_at_each_end():
     values = np.random.default_rng(0).permutation(np.arange(1.0, 1001.0))
     assert central_range(values) == (25.0, 975.0)
     assert central_range(np.array([7.0])) == (7.0, 7.0)
@@ -100,7 +102,7 @@ def test_the_central_range_leaves_out_a_fortieth_at_both_ends():
         (one_run(5.0), [5.0], NOT_TESTABLE),
     ],
 )
-def test_outcomes_of_one_value_a_seed(check, values, outcome):
+def test_outcomes_of_one_value_per_seed(check, values, outcome):
     verdict = check(np.array(values))
     assert verdict.outcome == outcome
     assert verdict.samples == len(values)
@@ -116,7 +118,7 @@ def test_without_runs_nothing_can_be_tested(check):
 
 
 @pytest.mark.parametrize("check", [higher(1.0), same(1.0), same(1.0, paired=True)])
-def test_a_comparison_takes_two_seeds_of_both(check):
+def test_a_comparison_needs_two_seeds_of_each(check):
     assert check(NOTHING, np.array([1.0, 2.0])).outcome == NOT_TESTABLE
     assert check(np.array([1.0]), np.array([1.0, 2.0])).outcome == NOT_TESTABLE
 
@@ -128,14 +130,14 @@ def test_one_runs_boundary_is_the_prediction_interval():
     assert one_run(edge + 1e-6)(values).outcome == NOT_CONFIRMED
 
 
-def test_an_episode_is_like_ours_if_it_is_within_the_central_range():
+def test_an_episode_is_compatible_within_the_central_range():
     times = [np.arange(1.0, 21.0), np.arange(21.0, 41.0)]  # 1 to 40: the central 95 % are 1 to 39
     assert one_episode(39.0)(times).outcome == COMPATIBLE
     assert one_episode(39.5)(times).outcome == NOT_CONFIRMED
     assert one_episode(39.0)(times).measured.mean == (10.5 + 30.5) / 2
 
 
-def test_episodes_that_do_not_arrive_are_told_and_take_no_time():
+def test_episodes_that_do_not_arrive_are_reported_without_a_time():
     some = [
         np.array([1.0, math.inf, math.inf]),
         np.array([2.0, 3.0, 4.0]),
@@ -159,7 +161,7 @@ def test_higher_is_a_test_of_the_difference_and_not_of_the_means():
     assert higher(3.0)(values, values).outcome == NOT_CONFIRMED  # by more than what does not matter
 
 
-def test_the_same_is_shown_and_not_merely_not_refuted():
+def test_equality_has_to_be_shown_not_only_not_refuted():
     values = np.array([1.0, 2.0, 3.0])
     assert same(1.0)(values, values).outcome == OPEN  # the interval is wider than that
     assert "more seeds would tell" in same(1.0)(values, values).reason

@@ -1,4 +1,4 @@
-"""Made-up rows of every arm, in which what somebody reports is so."""
+"""Made-up rows of every arm, in which the claims of a source are true."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from reproduction.arms import ARMS
 from reproduction.rows import COLUMNS, Trained
 
 SPREAD = np.array([-1.0, 0.0, 1.0, 0.5, -0.5])
-"""Of five seeds around what they are said to be."""
+"""Offsets of five seeds around the given values."""
 
 
 def made_up(
@@ -23,19 +23,19 @@ def made_up(
     centre=0.96,
     epoch=33,
 ):
-    """A row.
+    """Return a row with given results.
 
     Args:
-        arm: of which.
-        seed: makes returns, times and epochs differ a little from what is given.
-        last: return of the last training episodes.
+        arm: arm of the row.
+        seed: seed that shifts returns, times and epochs slightly from the given values.
+        last: mean return of the last training episodes.
         test: return of the test.
         success: share of the test episodes that succeed.
         tracking: rms torque error [%].
         largest: largest torque error [N*m].
         time: median time to the goal [s]; the episodes' are up to 20 % away from it.
-        centre: share of steps near the centre.
-        epoch: the epoch from which on episodes last 4000 steps and earn as much.
+        centre: share of steps near the center.
+        epoch: the epoch from which on episodes last 4000 steps and earn as many rewards.
     """
     shift = SPREAD[seed]
     times = time * np.linspace(0.8, 1.2, 41) + shift
@@ -57,7 +57,7 @@ def made_up(
 
 
 def trained(seed=0, epoch=35):
-    """A run whose episodes last 4000 steps, and earn as much, from an epoch on."""
+    """Return a run whose episodes last 4000 steps, and earn 4000, from an epoch on."""
     first = int(epoch + 2 * SPREAD[seed])
     short = [[0, 4000 * (n + k / 10), 390.0, 400] for n in range(first - 1) for k in range(1, 11)]
     long = [[0, 4000 * n, 3990.0, 4000] for n in range(first, 61)]
@@ -65,12 +65,12 @@ def trained(seed=0, epoch=35):
 
 
 def world(values, seeds=range(5)):
-    """The rows of every arm, by its name.
+    """Return the rows of every arm by name.
 
     Args:
         values: (task, settings, motor) -> arguments of `made_up`; each arm takes those of its task,
             settings and motor.
-        seeds: of every arm.
+        seeds: number of seeds of every arm.
     """
     return {
         arm.name: [made_up(arm, n, **values[arm.task, arm.settings, arm.motor]) for n in seeds]
@@ -111,7 +111,7 @@ PAPERS = {
         for motor in ("paper gains", "ideal")
     },
 }
-"""What the paper reports."""
+"""Values that the paper reports."""
 
 OTHERS = PAPERS | {
     ("pendulum", "paper", "paper gains"): {"last": -1400, "test": -1413, "success": 0.0},
@@ -148,4 +148,4 @@ OTHERS = PAPERS | {
     ("acrobot", "paper", "ideal"): {"last": -90, "test": -81, "time": 16.0},
     ("cartpole", "paper", "paper gains"): {"test": 500, "epoch": 40, "largest": 0.119},
 }
-"""Much of which is not so."""
+"""Values that contradict many of the claims."""

@@ -29,7 +29,8 @@ def test_assumed_values_are_listed_below_the_abilities():
     text = str(_abilities(explain(drive), drive, None))
     assert "at 12 V" in text
     assert (
-        "assumed, for none is given: controller.max_current = inf, motor.rotor_inertia = 0." in text
+        "assumed, because not specified: controller.max_current = inf, motor.rotor_inertia = 0."
+        in text
     )
 
 
@@ -69,7 +70,7 @@ def test_torque_range_with_a_supply_is_where_the_motor_settles():
         settled = []
         for command, speed in itertools.product((-1e3, 1e3), speeds):
             parameters, state, torque = (
-                parameters_type(DCMotorActuator)(*actuator.numbers),
+                parameters_type(DCMotorActuator)(*actuator.parameter_values),
                 actuator.State(0.0, 0.0, 0.0),
                 0.0,
             )

@@ -102,7 +102,7 @@ def test_omitted_and_missing_loops_are_explained():
     section = str(reports._loop([run_with({"lag": Lag(time_constant=0.1)})]))
     assert "lag: The delivered torque follows the desired one with a time constant" in section
     assert "It has no current loop." in section
-    assert "m: assumed, for none is given: supply.voltage = 24 V" in str(
+    assert "m: assumed, because not specified: supply.voltage = 24 V" in str(
         reports._loop([run_with({"m": Drive()})])
     )
 

@@ -1,7 +1,7 @@
-"""What stands between a command and its force, in doses: one thing at a time; and policies trained and tested on it.
+"""Axes of the study: one actuator effect each, at a severity, and arms trained and tested on them.
 
-Every dose is a pure number that means the same on every task: times in steps of the policy, forces
-in shares of the task's largest one, supplies in shares of what the task's motor needs.
+A severity is a dimensionless number with the same meaning on every task: times in policy steps,
+forces in shares of the task's largest force, supplies in shares of the voltage that the task needs.
 """
 
 import dataclasses
@@ -35,9 +35,9 @@ SECONDS: Mapping[str, float] = {
     "mountain_car": 4.0,
     "mountain_car_continuous": 25.0,
 }
-"""Task -> a training's computing time [s of one core], about. The tasks of the study."""
+"""Task -> approximate time of a training [s of one core]; the keys are the study's tasks."""
 BUDGETS: Mapping[str, int] = {"pendulum": 160_000}
-"""Task -> environment steps of a training, where the agent's default budget leaves some seeds short."""
+"""Task -> environment steps of a training, if the agent's default is too short for some seeds."""
 FLOORS: Mapping[str, float] = {
     "pendulum": -1223.0,
     "cartpole": 17.8,
@@ -46,9 +46,9 @@ FLOORS: Mapping[str, float] = {
     "mountain_car": -200.0,
     "mountain_car_continuous": -32.9,
 }
-"""Task -> mean return of random actions on ideal forces, over 300 episodes: the lower end of the task's span."""
-CENTRE_RADIUS = 0.1
-"""How near to the centre the paper's CartPole is rewarded [m]."""
+"""Task -> lower end of the span: mean return of random actions on ideal forces, 300 episodes."""
+CENTER_RADIUS = 0.1
+"""Distance from the center within which the paper's CartPole is rewarded [m]."""
 
 REFERENCE_SPEEDS: Mapping[str, float] = {
     "pendulum": 6.0,
@@ -58,79 +58,79 @@ REFERENCE_SPEEDS: Mapping[str, float] = {
     "mountain_car": 0.05,
     "mountain_car_continuous": 0.05,
 }
-"""Task -> speed [rad/s or m/s] of the actuated joint that a motor for it must still push at."""
+"""Task -> speed [rad/s or m/s] of the actuated joint at which a motor must still deliver force."""
 
 
-def posed(task: str, actuator: Any = IDEAL, **fields: Any) -> EnvConfig:
-    """The task as every arm and test of the study has it: at least ten integration steps to a step of the policy.
+def study_env(task: str, actuator: Any = IDEAL, **fields: Any) -> EnvConfig:
+    """Return a task's environment for the study, with at least ten integration steps a policy step.
 
-    Ideal and real actuators are integrated alike, so that the actuator alone makes the difference.
+    Ideal and real actuators share the integration step, so that only the actuator differs.
     """
-    # CartPole by the paper's reward: by Gymnasium's nearly every policy is at the ceiling, and
-    # nothing told apart
-    options = {"center_radius": CENTRE_RADIUS} if task == "cartpole" else {}
+    # CartPole uses the paper's reward: with Gymnasium's, nearly every policy reaches the maximum
+    # and differences disappear.
+    options = {"center_radius": CENTER_RADIUS} if task == "cartpole" else {}
     return EnvConfig(task, actuator, timestep=timestep(task), options=options, **fields)
 
 
 def timestep(task: str) -> float:
-    """Integration step [s] of the study's environments of a task."""
+    """Return the integration step [s] of the study's environments of a task."""
     return find_task(task).step_duration / max(find_task(task).motor_inner_steps, 10)
 
 
-def lag(task: str, dose: float) -> EnvConfig:
-    """A time constant of so many steps of the policy, and nothing lost in the end."""
-    return posed(task, Lag(dose * find_task(task).step_duration))
+def lag(task: str, severity: float) -> EnvConfig:
+    """Return the task with a first-order lag; the severity is its time constant [policy steps]."""
+    return study_env(task, Lag(severity * find_task(task).step_duration))
 
 
-def weakness(task: str, dose: float) -> EnvConfig:
-    """Forces that come short by a share, at once."""
-    return posed(task, Lag(0.0, gain=1.0 - dose))
+def weakness(task: str, severity: float) -> EnvConfig:
+    """Return the task with forces reduced by a share."""
+    return study_env(task, Lag(0.0, gain=1.0 - severity))
 
 
-def delay(task: str, dose: float) -> EnvConfig:
-    """Commands that come so many steps of the policy late."""
-    return posed(
-        task, disturbances=Disturbances(command_delay=dose * find_task(task).step_duration)
+def delay(task: str, severity: float) -> EnvConfig:
+    """Return the task with delayed commands; the severity is the delay [policy steps]."""
+    return study_env(
+        task, disturbances=Disturbances(command_delay=severity * find_task(task).step_duration)
     )
 
 
-def friction(task: str, dose: float) -> EnvConfig:
-    """Coulomb friction in the actuated joint, in shares of the largest force."""
-    return posed(task, joint=Joint(friction=dose * find_task(task).max_force))
+def friction(task: str, severity: float) -> EnvConfig:
+    """Return the task with Coulomb friction in the actuated joint [largest force]."""
+    return study_env(task, joint=Joint(friction=severity * find_task(task).max_force))
 
 
 def motor_constant(task: str) -> float:
-    """Torque constant [N*m/A] of a motor of 1 ohm that asks for the least voltage at the task's reference point.
+    """Return the torque constant [N*m/A] of the 1 ohm motor with the lowest voltage for a task.
 
-    Largest force F at the reference speed w: u = F/k + k*w is least for k = sqrt(F/w), where both
-    terms are equal.
+    For the largest force F at the reference speed w, u = F/k + k*w is minimal at k = sqrt(F/w),
+    where both terms are equal.
     """
     return math.sqrt(find_task(task).max_force / REFERENCE_SPEEDS[task])
 
 
 def needed_voltage(task: str) -> float:
-    """Voltage [V] that this motor takes for the largest force at the reference speed: 2*sqrt(F*w)."""
+    """Return that motor's voltage [V] at the largest force and reference speed: 2*sqrt(F*w)."""
     return 2.0 * math.sqrt(find_task(task).max_force * REFERENCE_SPEEDS[task])
 
 
-def supplied(task: str, volts: float) -> Drive:
-    """A motor of 1 ohm whose loop settles in a fraction of an integration step, on a supply."""
+def drive_on_supply(task: str, volts: float) -> Drive:
+    """Return a drive with a 1 ohm motor, a loop faster than the integration step, and a supply."""
     step, constant = timestep(task), motor_constant(task)
     motor = GearMotor(1.0, step / 20.0, constant, constant, rotor_inertia=0.0)
     loop = SampledLoop(sample_rate=20.0 / step, max_current=find_task(task).max_force / constant)
     return Drive(motor, loop, Supply(volts))
 
 
-def supply(task: str, dose: float) -> EnvConfig:
-    """A drive with anti-windup and a current limit, on a supply that comes short by a share of what is needed."""
-    return posed(task, supplied(task, (1.0 - dose) * needed_voltage(task)))
+def supply(task: str, severity: float) -> EnvConfig:
+    """Return the task with a drive whose supply lacks a share of the needed voltage."""
+    return study_env(task, drive_on_supply(task, (1.0 - severity) * needed_voltage(task)))
 
 
-def noise(task: str, dose: float) -> EnvConfig:
-    """A loop whose current sensor is noisy, with a standard deviation in shares of the largest current.
+def noise(task: str, severity: float) -> EnvConfig:
+    """Return the task with a noisy current sensor; the severity is its deviation [largest current].
 
-    The winding's time constant is ten integration steps and half the error is gone after one, so
-    that half of a sample's noise becomes torque.
+    The winding's time constant is ten integration steps and the loop halves the error in one step,
+    so half of each noise sample becomes torque.
     """
     step, constant = timestep(task), motor_constant(task)
     inductance, largest = 10.0 * step, find_task(task).max_force / constant
@@ -139,9 +139,9 @@ def noise(task: str, dose: float) -> EnvConfig:
         kp=kp,
         ki=kp / inductance,
         max_voltage=100.0 * needed_voltage(task),
-        current_noise=dose * largest,
+        current_noise=severity * largest,
     )
-    return posed(task, DCMotorActuator(Motor(1.0, inductance, constant, constant), loop))
+    return study_env(task, DCMotorActuator(Motor(1.0, inductance, constant, constant), loop))
 
 
 _LOOPS = {"weaker": "weaker", "paper": "paper"}
@@ -163,28 +163,27 @@ REAL: Mapping[str, Mapping[str, Any]] = {
         }
     },
 }
-"""Task -> drives that policies were trained through, each by the name of its arm and of its test: a
-motor that `codrl-mj motor choose` calls `try it`, for some bound says that it does not suffice (on
-the cars there is none), and the paper's under two loops.
+"""Task -> name of arm and test -> drive: a motor that `codrl-mj motor choose` judges `try it`,
+because some bound is not met (the cars have none), and the paper's motor with two current loops.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """One thing that an actuator may do to a command."""
+    """One effect of an actuator on a command."""
 
     title: str
-    """What it is."""
+    """Title in tables and figures."""
     unit: str
-    """What its doses are in."""
-    doses: tuple[float, ...]
-    """Six of them, the first is none."""
-    trained: Mapping[str, float]
-    """Task -> the one of them that is trained through, chosen before: in a pilot with others, or by a plan's rule."""
-    at: Callable[[str, float], EnvConfig]
-    """(task, dose) -> the environment."""
-    own_motor: bool = False
-    """Whether the first dose, too, is a motor of its own, and not ideal forces."""
+    """Unit of the severity."""
+    severities: tuple[float, ...]
+    """Six tested severities; the first is 0."""
+    training_severity: Mapping[str, float]
+    """Task -> severity used in training, chosen in a pilot or by the plan's rule."""
+    make_env: Callable[[str, float], EnvConfig]
+    """Function (task, severity) -> environment."""
+    motor_at_zero: bool = False
+    """True if severity 0 is a motor without the effect, not ideal forces."""
 
 
 AXES: Mapping[str, Axis] = {
@@ -208,7 +207,7 @@ AXES: Mapping[str, Axis] = {
         (0.0, 0.2, 0.35, 0.5, 0.6, 0.7),
         {"pendulum": 0.35, "furuta": 0.6, "acrobot": 0.5},
         supply,
-        own_motor=True,
+        motor_at_zero=True,
     ),
     "delay": Axis(
         "Delay",
@@ -230,17 +229,18 @@ AXES: Mapping[str, Axis] = {
         (0.0, 0.1, 0.2, 0.4, 0.8, 1.6),
         {"pendulum": 0.8, "furuta": 0.8, "acrobot": 1.6},
         noise,
-        own_motor=True,
+        motor_at_zero=True,
     ),
 }
 """The axes by name."""
 
 
 def arm(task: str, name: str, env: EnvConfig) -> Arm:
-    """The arm of the task's agent in an environment: default settings, and nothing is evaluated on the way."""
+    """Return the arm of a task's agent in an environment, with default settings."""
     agent = "sarsa" if task == "mountain_car" else "ppo"
     changes: dict[str, Any] = {"total_steps": BUDGETS[task]} if task in BUDGETS else {}
     base = TrainConfig.preset(task, agent, **changes)
+    # Evaluations and checkpoints during training would only cost time.
     never = 10**9
     config = dataclasses.replace(
         base, env=env, evaluation_interval=never, checkpoint_interval=never
@@ -250,15 +250,17 @@ def arm(task: str, name: str, env: EnvConfig) -> Arm:
 
 @functools.cache
 def ideal(task: str) -> Arm:
-    """Trained on forces that come as they are asked for."""
-    return arm(task, "ideal", posed(task))
+    """Return the arm trained on ideal forces."""
+    return arm(task, "ideal", study_env(task))
 
 
 def generic(base: Arm) -> Arm:
-    """Trained without a model of the motor, as is common: random strength, lag, delay, and random pushes.
+    """Return the arm trained with generic randomization: strength, lag, delay and random pushes.
+
+    This is the common practice without a model of the motor.
 
     Args:
-        base: the arm of a task of ours on ideal forces, of which all else is kept.
+        base: arm of a built-in task on ideal forces; all other settings are kept.
     """
     env, definition = base.config.env, find_task(base.task)
     step, pulse = definition.step_duration, 0.25 * definition.max_force
@@ -274,6 +276,6 @@ def generic(base: Arm) -> Arm:
     return dataclasses.replace(base, name=f"{base.task}: generic", config=config)
 
 
-def at_home(arm: Arm) -> Trial:
-    """Policies tested on ideal forces."""
-    return Trial(arm, "ideal", posed(arm.task))
+def ideal_trial(arm: Arm) -> Trial:
+    """Return the test of an arm's policies on ideal forces."""
+    return Trial(arm, "ideal", study_env(arm.task))
