@@ -211,34 +211,40 @@ def page(tables: Mapping[str, list[dict[str, str]]]) -> str:
     heads = ("motor", "V", "gear", "stall [N·m]", "no load [rad/s]", "continuous [N·m]")
     actuator_names = [f"`{name}`" for name in dict.fromkeys(row["actuator"] for row in tasks)]
     paper = {
-        "settles within 2 % [s]": "settled_2_s",
-        "is there after a policy's step [%]": "first_step_percent",
+        "settling time to within 2 % [s]": "settled_2_s",
+        "torque at the end of the first policy step [%]": "first_step_percent",
     }
     loop = motors[0]
     return f"""# Actuators in numbers
 
-What every named [actuator](actuators.md) does on one hinge, blocked or free. More numbers: [tasks]({TABLES["tasks"]}),
-[motors]({TABLES["motors"]}).
+This page lists the response of every named [actuator](actuators.md). It is measured in simulation
+on one hinge that is either blocked or free to turn. The CSV files have more values:
+[tasks]({TABLES["tasks"]}), [motors]({TABLES["motors"]}).
 
 ![Share of the largest force that each of the paper's actuators delivers](pictures/actuators_in_numbers.png)
 
 ## The paper's actuators
 
-A step to the task's largest force, over the tasks (0: within the first integration step; all is there by {LONG:g} s):
+The desired force steps from zero to the task's largest force. Each entry is the range over the
+tasks. A settling time of 0 means that the force settles within the first integration step. All
+forces have settled after {LONG:g} s.
 
 {_table(["", *actuator_names], [[words, *_ranges(tasks, column)] for words, column in paper.items()])}
 
 ## The catalogue
 
-Each at its own gear and nominal voltage (24 V where none is printed), cold, without a limit of the current, which
-settles in {_number(loop["settled_2_ms"])} ms under a loop at 20 kHz (bandwidth {_number(loop["bandwidth_hz"], 4)} Hz).
+Each motor has its own gear and its nominal voltage (24 V if the datasheet prints none). The
+winding is cold, and the current is not limited. With a current loop at 20 kHz (bandwidth
+{_number(loop["bandwidth_hz"], 4)} Hz) the current settles in {_number(loop["settled_2_ms"])} ms.
 
 {_table(heads, map(_motor_line, motors))}
 
-Torques are the output's, past friction; *continuous*, at the current that the winding bears for good. t: has thermal
-values. –: not printed. Stall and no load are measured; they are as printed, to 5 %.
+Torques are net torques at the output, after friction. The *continuous* torque belongs to the
+largest current that the winding can carry continuously. A "t" after the name marks motors with
+thermal values. A "–" marks values that the datasheet does not print. Stall torque and no-load
+speed are measured in simulation and agree with the printed values within 5 %.
 
-`codrl-mj motor show NAME` has the source of every value, and where a datasheet contradicts itself.
+`codrl-mj motor show NAME` prints the source of every value and contradictions in the datasheet.
 """
 
 

@@ -91,7 +91,7 @@ def custom_robot(out: Path) -> None:
 
 
 def third_party_env(out: Path) -> None:
-    """Write a frame of the film of docs/foreign.md: HalfCheetah, its motors, random actions."""
+    """Write a frame of the film of docs/external_envs.md: HalfCheetah, its motors, random actions."""
     with tempfile.TemporaryDirectory() as folder:
         film = (
             "--motor",
