@@ -604,7 +604,7 @@ SERVO = """
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_motors_with_the_plugin_have_the_same_checks(bare_engine, integrator):
     model = behind_plugin(
-        arm(integrator), {"one": ACTUATORS["noisy_current_loop"], "two": ACTUATORS["somebody's"]}
+        arm(integrator), {"one": ACTUATORS["noisy_current_loop"], "two": ACTUATORS["custom"]}
     )
     result = validate_model(model, quick=True)
     assert [
@@ -705,7 +705,7 @@ def test_raises_for_a_model_without_a_motor():
         (["acrobat"], "unknown task 'acrobat': did you mean 'acrobot'?"),
         (["--model", "nowhere.xml"], "no model at nowhere.xml"),
         (["--model", "broken.xml"], "broken.xml: MuJoCo cannot compile this model: "),
-        (["--model", "bare.xml"], "no motor of codrl_mj"),
+        (["--model", "bare.xml"], "the model has no actuators"),
         (["--model", "bare.xml", "cartpole"], "--model"),
         (["cartpole", "--out", "bare.xml"], "cannot write to bare.xml"),
         (["cartpole", "--out", "bare.xml/certificate"], "bare.xml is not a folder"),

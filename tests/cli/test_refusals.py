@@ -34,7 +34,7 @@ REFUSED = [
     ("render pendulm", "no run configuration at pendulm/config.json: did you mean 'pendulum'?"),
     (
         "train CartPole-v1",
-        "has no MuJoCo model built from XML, and so no motors: take 'cartpole', our task",
+        "has no MuJoCo model built from XML, and so no motors: use 'cartpole', the task of this package",
     ),
     ("train cartpole more", "unexpected 'more': codrl-mj train --help"),
     ("train cartpole --seed", "--seed needs a value: a whole number"),
@@ -66,7 +66,7 @@ REFUSED = [
     ),
     (
         "train InvertedPendulum-v5 --num-envs 1e9",
-        "num_envs = 1000000000: takes about 2e+05 GB of memory, of which",
+        "num_envs = 1000000000: takes about 2e+05 GB of memory, but",
     ),
     ("view cartpole --port 99999", "--port 99999: must be from 1 to 65535"),
     ("train cartpole --total-steps 0", "total_steps = 0"),

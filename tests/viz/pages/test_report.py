@@ -91,7 +91,7 @@ def test_the_papers_current_loop_has_margins_and_a_step(text):
 
 def test_omitted_and_missing_loops_are_explained():
     def run_with(actuators):
-        return RunEpisode("run", SimpleNamespace(driven=actuators), None, None, None, 0)
+        return RunEpisode("run", SimpleNamespace(actuators_by_name=actuators), None, None, None, 0)
 
     drives = {
         f"m{index}": find_drive("maxon-dcx22l", bandwidth=300.0 + index) for index in range(6)
