@@ -69,7 +69,7 @@ MODULE_NAMES = {
             "summaries.find_runs",
             "summaries.read_run",
         ),
-        *("summaries.compare", "files.writing"),
+        *("summaries.compare", "files.atomic_write"),
     ),
     "viz.view": ("session.Session",),
 }
