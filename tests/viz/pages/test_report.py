@@ -100,7 +100,7 @@ def test_omitted_and_missing_loops_are_explained():
         reports._loop([run_with(drives)])
     )
     section = str(reports._loop([run_with({"lag": Lag(time_constant=0.1)})]))
-    assert "lag: The delivered torque follows the desired one with a time constant" in section
+    assert "lag: First-order lag with an optional delay: the torque follows the command" in section
     assert "It has no current loop." in section
     assert "m: assumed, because not specified: supply.voltage = 24 V" in str(
         reports._loop([run_with({"m": Drive()})])
