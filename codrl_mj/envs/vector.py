@@ -207,7 +207,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             write(name, env_value, self.setup, model)
             for field, rows in (fields | visual_fields).items():
                 rows[row] = field_of(model, field)
-        # `set_model` also resets the simulations, so their states are saved and restored around it.
+        # A reset or restore must follow `set_model`; restoring keeps the states.
         snapshot = self.physics.snapshot()
         self.physics.set_model(np.arange(self.num_envs), fields)
         self.physics.restore(snapshot)
@@ -322,7 +322,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         kernels, steps = self._compiled()
         steps.forces[:], steps.stepping[:] = forces, stepping
         steps.limit[0] = np.inf if self.max_episode_steps is None else self.max_episode_steps
-        num_diverged = self.physics.step(kernels.step_rows, steps)
+        has_diverged = self.physics.step(kernels.step_rows, steps)
         rewards, terminated, truncated = (
             steps.rewards.copy(),
             steps.terminated.copy(),
@@ -330,7 +330,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         )
         columns = steps.signals.reshape(-1, *forces.shape).copy()
         self.signals = signals = self.setup.signals([forces, *columns], forces)
-        if num_diverged:
+        if has_diverged:
             # `check_finite` raises. Record which episodes ended first, because they must still be
             # reset.
             self._ended |= terminated | truncated
