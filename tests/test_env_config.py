@@ -278,7 +278,7 @@ def test_numpys_numbers_are_numbers():
             "sutton_barto_reward = 1: must be True or False",
         ),
         ({"task": "cartpole", "center_radius": True}, "center_radius = True: must be a number > 0"),
-        ({"inner_steps": 3}, "it has no task"),
+        ({"inner_steps": 3}, "env.task: is missing"),
         ("cartpole", "env = 'cartpole': must be a mapping"),
     ],
 )

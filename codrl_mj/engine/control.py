@@ -61,7 +61,7 @@ def _is_ours(model: int, actuator: int) -> bool:
 
 @functools.cache
 def compiled_motors() -> dict[str, Any]:
-    """Return the motors' callbacks by MuJoCo's names for them, as its setters take them.
+    """Return the motors' callbacks by MuJoCo's names, in the form that its setters accept.
 
     `control` advances the actuators; `act_bias` returns the torque that they deliver. They are
     compiled on first use. The cache keeps them alive for as long as the process runs, because
@@ -75,21 +75,21 @@ def compiled_motors() -> dict[str, Any]:
             return
         if DATA.pbase(data) != 0:
             # The engine calls this with an open stack frame only in stages 2 to 4 of RK4. A drive
-            # is sampled once a step, so its force is held in these stages.
+            # is sampled once per step, so its force is held in these stages.
             return
         time, timestep = DATA.time(data), MODEL.opt.timestep(model)
         for actuator in range(MODEL.nactuator(model)):
             if not _is_ours(model, actuator) or is_disabled(model, actuator):
                 continue
             user, slot = user_address(model, actuator), _slot_of(model, data, actuator)
-            number = int(f64(user)[2])
+            family_number = int(f64(user)[2])
             # The engine may call this several times at one time (mj_forward, then mj_step). The
             # candidate state becomes the state only after time has advanced.
             if time != f64(slot)[0]:
-                commit_slot(number, slot, time)
+                commit_slot(family_number, slot, time)
             out = MODEL.actuator_outadr(model)[actuator]
             advance_slot(
-                number,
+                family_number,
                 user + 8 * USER_HEADER_SIZE,
                 timestep,
                 slot,
@@ -97,7 +97,9 @@ def compiled_motors() -> dict[str, Any]:
                 DATA.actuator_length(data)[out],
                 DATA.actuator_velocity(data)[out],
                 time,
-                output_inertia(model, data, out, 1.0) if family_size(number, INERTIA) else math.inf,
+                output_inertia(model, data, out, 1.0)
+                if family_size(family_number, INERTIA)
+                else math.inf,
             )
 
     @cfunc(types.float64(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
@@ -119,13 +121,13 @@ _GROUPS: dict[str, tuple[tuple[str, ...], Callable[[], dict[str, Any]], str]] = 
     "motor": (("control", "act_bias"), compiled_motors, "actuator='ideal' or physics='analytic'"),
     "hill": (("passive",), compiled_hill, "physics='analytic'"),
 }
-"""Group -> MuJoCo's names of its callbacks, as in `mujoco.set_mjcb_...`; the function that compiles
-them, by these names; and settings of an environment that needs no such callback.
+"""Group -> names of its callbacks, as in `mujoco.set_mjcb_NAME`; function that returns the compiled
+callbacks by name; and settings of an environment that does not need them.
 """
 
 
 class CallbackInUseError(RuntimeError):
-    """Another library's MuJoCo callback is installed where ours has to go."""
+    """Another library has set a MuJoCo callback that the package needs."""
 
 
 _INSTALLED: dict[str, Any] = {}
@@ -133,8 +135,9 @@ _INSTALLED: dict[str, Any] = {}
 
 
 def _read_callback(name: str) -> tuple[bool, Any]:
-    """Return True if MuJoCo's callback of a name is ours, and the callback or None."""
-    # Comparison with the pointers that we set needs no compilation of ours.
+    """Return a pair: True if MuJoCo's present callback is ours; and the callback, or None."""
+    # The pointers that `install` set are compared, because asking for our callbacks would compile
+    # them.
     present = getattr(mujoco, f"get_mjcb_{name}")()
     return present is not None and present is _INSTALLED.get(name), present
 
@@ -191,7 +194,7 @@ def uninstall() -> None:
 
 
 def _callbacks(groups: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Return (group, MuJoCo's name) for each callback of some groups, or of `motor` if empty."""
+    """Return (group, MuJoCo's name) for each callback of the groups; without groups, of `motor`."""
     for group in groups:
         if group not in _GROUPS:
             raise ValueError(f"callbacks {group!r}: must be one of {', '.join(_GROUPS)}")

@@ -1,8 +1,8 @@
 """Compiled actuator families: a table of C functions that both backends call by family number.
 
 A family's number is in the model's `user` data, so a callback or plugin that was compiled once also
-runs families that were written later. The compilation of a family takes a fraction of a second,
-once a process.
+runs families that were written later. A family is compiled once per process, in a fraction of a
+second.
 """
 
 import contextlib
@@ -45,9 +45,9 @@ It is split in two because XML files keep only six digits of a number.
 class SlotHeader(NamedTuple):
     """Header of an actuator's slot, its state in `data.act` or `data.plugin_state`.
 
-    The header is followed by the family's committed state (at time `tick`), the candidate state
-    one step later, the signals, and a 0. The engine multiplies the last activation by the
-    actuator's gain, which is 0; an infinite signal in its place would give NaN.
+    The header is followed by the family's committed state (at time `tick`), the candidate state one
+    step later, the signals, and a 0. The 0 is there because the engine multiplies the last
+    activation by the actuator's gain, which is 0: an infinite signal in its place would give NaN.
     """
 
     tick: float
@@ -91,7 +91,7 @@ def loaded_families() -> tuple[Family, ...]:
 
 
 def slot_size(family: Family) -> int:
-    """Return the length of the slot of a family's actuators."""
+    """Return the length of a slot of this family."""
     return signals_offset(family) + len(family.Signals._fields) + 1
 
 
@@ -101,7 +101,7 @@ def signals_offset(family: Family) -> int:
 
 
 def user_header(family: Family) -> tuple[float, float, float]:
-    """Return the header of the `user` data of a family's actuators; the parameters follow it."""
+    """Return the header of an actuator's `user` data; the parameters follow it."""
     return *SIGNATURE, float(family_id(family))
 
 
@@ -116,14 +116,14 @@ def load_family(family: Family) -> None:
             cannot compile `advance`; or `advance` does not return what the family declares.
     """
     check_family(family)
-    number, sizes = family_id(family), family_sizes(family)
-    loaded, _ = _COMPILED.get(number, (None, None))
+    family_number, sizes = family_id(family), family_sizes(family)
+    loaded, _ = _COMPILED.get(family_number, (None, None))
     if loaded is family:
         return
     if loaded is not None and import_path(loaded) != import_path(family):
         raise ValueError(
-            f"families {import_path(family)} and {import_path(loaded)} have the same number {number}:"
-            " rename one"
+            f"families {import_path(family)} and {import_path(loaded)} have the same number"
+            f" {family_number}: rename one"
         )
     if loaded is not None and family_sizes(loaded) != sizes:
         raise ValueError(
@@ -134,15 +134,18 @@ def load_family(family: Family) -> None:
     if family.INERTIA:
         load_inertia()
     function, text = _compile(family), ctypes.create_string_buffer(import_path(family).encode())
-    _SIZES[number], _REFERENCES[number] = (*sizes, slot_size(family)), ctypes.addressof(text)
+    _SIZES[family_number], _REFERENCES[family_number] = (
+        (*sizes, slot_size(family)),
+        ctypes.addressof(text),
+    )
     # The function's address is set last: with it the family counts as compiled.
-    _ADDRESSES[number] = function.address
+    _ADDRESSES[family_number] = function.address
     # The previous entry is kept alive: another thread may still be running its function.
-    _COMPILED[number] = family, (function, text, _COMPILED.get(number))
+    _COMPILED[family_number] = family, (function, text, _COMPILED.get(family_number))
 
 
 def family_sizes(family: Family) -> tuple[int, ...]:
-    """Return the numbers of states, signals and parameters of a family, `INERTIA` and `MOTION`."""
+    """Return a family's row in the table of sizes, without its `slot_size`."""
     counts = (len(kind._fields) for kind in (family.State, family.Signals, parameters_type(family)))
     return *counts, int(family.INERTIA), int(family.MOTION)
 
@@ -154,13 +157,13 @@ def family_replaced(family: Family, replacement: Family) -> Iterator[None]:
     Both families must have the same states and signals.
     """
     load_family(family)
-    number, function = family_id(family), _compile(replacement)
-    original = _ADDRESSES[number]
-    _ADDRESSES[number] = function.address
+    family_number, function = family_id(family), _compile(replacement)
+    original = _ADDRESSES[family_number]
+    _ADDRESSES[family_number] = function.address
     try:
         yield
     finally:
-        _ADDRESSES[number] = original
+        _ADDRESSES[family_number] = original
 
 
 _FOREIGN_PACKAGES = sys.stdlib_module_names | {"numba", "numpy", "scipy"}
@@ -203,26 +206,31 @@ def _register_callees(function: Any) -> None:
 
 
 @functools.cache
-def compiled_function(function: Callable[..., Any], form: Form, declared: str, *kinds: Any) -> Any:
-    """Compile a user's function for argument types; check that numba gives its result a form.
+def compiled_function(
+    function: Callable[..., Any], form: Form, declared: str, *argument_types: Any
+) -> Any:
+    """Compile a user's function, and check that its result has the declared form.
 
-    The check needs a compilation. It is skipped if an earlier process has checked this function.
+    The check needs the compiled function. It is skipped if the function passed it in an earlier
+    process.
     """
-    compiled, marker = internal(function), VerifiedMarker("fits", function, form, kinds)
+    compiled, marker = internal(function), VerifiedMarker("fits", function, form, argument_types)
     try:
         _register_callees(function)
         if marker.exists():
             return compiled
-        compiled.compile(kinds)
+        compiled.compile(argument_types)
     except Exception as error:
         raise ValueError(compile_error_message(function, error)) from error
-    check_form(function, _example(compiled.overloads[kinds].signature.return_type), form, declared)
+    check_form(
+        function, _example(compiled.overloads[argument_types].signature.return_type), form, declared
+    )
     marker.write()
     return compiled
 
 
 def _example(kind: Any) -> Any:
-    """Return a value of a numba type; the type itself unless it is a number or a tuple of such."""
+    """Return 0.0 for a numeric numba type, a tuple for a tuple type, and other types unchanged."""
     if isinstance(kind, types.BaseTuple):
         return tuple(map(_example, kind))
     return 0.0 if isinstance(kind, types.Float | types.Integer | types.Boolean) else kind
@@ -231,13 +239,13 @@ def _example(kind: Any) -> Any:
 @functools.cache
 def _compile(family: Any) -> Any:
     parameters_of, state_of = parameters_type(family), family.State
-    kinds = (
+    argument_types = (
         named_tuple_type(parameters_of),
         _F64,
         named_tuple_type(state_of),
         named_tuple_type(Inputs),
     )
-    advance = compiled_function(family.advance, *advance_signature(family), *kinds)
+    advance = compiled_function(family.advance, *advance_signature(family), *argument_types)
 
     @cfunc(_ADVANCE_TYPE, nogil=True, error_model="numpy")
     def step(
@@ -289,20 +297,20 @@ def compiled_advance(family: Family) -> Callable[..., Any]:
 
 @functools.cache
 def compiled_observe(family: Family) -> Any:
-    """Return a compiled (parameters, signals, timestep, time, key, readings).
+    """Return a compiled function (parameters, signals, timestep, time, key, readings) -> None.
 
     It writes the sensors' readings to `readings`. Parameters, signals and readings are passed by
     address.
     """
     parameters_of, signals_of = parameters_type(family), family.Signals
-    kinds = (
+    argument_types = (
         named_tuple_type(parameters_of),
         types.float64,
         named_tuple_type(signals_of),
         named_tuple_type(Inputs),
     )
     observe = compiled_function(
-        family.observe, family.OBSERVED, f"{family.__name__}.OBSERVED", *kinds
+        family.observe, family.OBSERVED, f"{family.__name__}.OBSERVED", *argument_types
     )
 
     @internal
@@ -324,21 +332,21 @@ def compiled_observe(family: Family) -> Any:
 
 
 @internal
-def is_compiled(number: float) -> bool:
+def is_compiled(family_number: float) -> bool:
     """Return True if the table has a family of this number; any float is allowed."""
-    return 0.0 <= number < 1e6 and u64(addresses_pointer())[int(number)] != 0
+    return 0.0 <= family_number < 1e6 and u64(addresses_pointer())[int(family_number)] != 0
 
 
 @internal(inline="always")
-def family_size(number: int, column: int) -> int:
+def family_size(family_number: int, column: int) -> int:
     """Return a column of the table of sizes, such as `SLOT_SIZE`, for a family's number."""
-    return i32(sizes_pointer())[6 * number + column]
+    return i32(sizes_pointer())[6 * family_number + column]
 
 
 @internal(inline="always")
-def has_reference(number: int, text: int) -> bool:
+def has_reference(family_number: int, text: int) -> bool:
     """Return True if the C string at an address equals a family's `reference`."""
-    name, index = u64(references_pointer())[number], 0
+    name, index = u64(references_pointer())[family_number], 0
     while u8(name)[index] == u8(text)[index]:
         if u8(name)[index] == 0:
             return True
@@ -347,9 +355,9 @@ def has_reference(number: int, text: int) -> bool:
 
 
 @internal
-def commit_slot(number: int, slot: int, time: float) -> None:
+def commit_slot(family_number: int, slot: int, time: float) -> None:
     """Make an actuator's candidate state the committed one, after a step to `time`."""
-    values, num_states = f64(slot), family_size(number, STATES)
+    values, num_states = f64(slot), family_size(family_number, STATES)
     values[0] = time
     for entry in range(SLOT_HEADER_SIZE, SLOT_HEADER_SIZE + num_states):
         values[entry] = values[entry + num_states]
@@ -357,7 +365,7 @@ def commit_slot(number: int, slot: int, time: float) -> None:
 
 @internal
 def advance_slot(
-    number: int,
+    family_number: int,
     parameters: int,
     timestep: float,
     slot: int,
@@ -374,11 +382,11 @@ def advance_slot(
     """
     # Repeated calls within a step start from the same committed state, and only overwrite the
     # candidate.
-    values, state_bytes = f64(slot), 8 * family_size(number, STATES)
+    values, state_bytes = f64(slot), 8 * family_size(family_number, STATES)
     state = slot + 8 * SLOT_HEADER_SIZE
     candidate = state + state_bytes
     values[2] = call(
-        u64(addresses_pointer())[number],
+        u64(addresses_pointer())[family_number],
         *(
             parameters,
             timestep,

@@ -90,7 +90,7 @@ def struct(name: str) -> type[ctypes.Structure]:
 
 
 def offset(struct_name: str, field: str) -> int:
-    """Return the offset [bytes] of a field, which may be dotted (`opt.timestep`)."""
+    """Return the offset [bytes] of a field, whose name may be dotted (`opt.timestep`)."""
     kind, total = struct(struct_name), 0
     for part in field.split("."):
         if not hasattr(kind, part):
@@ -132,7 +132,7 @@ _PROBE = """
 def _live_objects() -> dict[str, Any]:
     """Return a live model and its data by the names of their structures.
 
-    Each of their counts has a different value, so that no field can be mistaken for another.
+    All counts differ, so that a wrong offset cannot read the right value by chance.
     """
     # MjSpec bypasses the patched loaders of `motors_added`: the probe must not get motors.
     model = mujoco.MjSpec.from_string(_PROBE).compile()
@@ -158,12 +158,13 @@ def check_field(struct_name: str, field: str) -> None:
         owner = thread.submit(_live_objects).result()[struct_name]
     raw: Any = struct(struct_name).from_address(owner._address)
     names = [field]
-    if field.count(".") == 0 and not _is_shown(owner, field):
+    if field.count(".") == 0 and not _is_exposed(owner, field):
         order = [member.name for member in STRUCTS[struct_name].fields]
         index = order.index(field)
         before, after = order[:index][::-1], order[index + 1 :]
         names = [
-            next(member for member in side if _is_shown(owner, member)) for side in (before, after)
+            next(member for member in side if _is_exposed(owner, member))
+            for side in (before, after)
         ]
     for name in names:
         live, value = owner, raw
@@ -172,13 +173,13 @@ def check_field(struct_name: str, field: str) -> None:
         expected = live.ctypes.data if hasattr(live, "ctypes") else live
         if value != expected:
             raise LayoutError(
-                f"MuJoCo {mujoco.__version__}: {struct_name}.{name} reads {value!r} where its"
-                f" layout says, expected {expected!r}. Install a MuJoCo that this version of"
+                f"MuJoCo {mujoco.__version__}: {struct_name}.{name} reads {value!r} at its"
+                f" declared offset, expected {expected!r}. Install a MuJoCo that this version of"
                 " codrl_mj was tested with (see pyproject.toml)"
             )
 
 
-def _is_shown(owner: Any, field: str) -> bool:
+def _is_exposed(owner: Any, field: str) -> bool:
     """Return True if the bindings expose a field and it is not empty."""
     live = getattr(owner, field, None)
     return isinstance(live, int | float) or getattr(live, "size", 0) > 0
@@ -220,7 +221,7 @@ def _function(struct_name: str, path: str, node: Any) -> Any:
     element = from_ctypes(_SCALARS[node.inner_type.name if is_array else node.name])
     kind, field_offset = types.CPointer(element) if is_array else element, offset(struct_name, path)
 
-    @llvm_intrinsic(lambda address: kind(types.uintp))  # noqa: ARG005 - one
+    @llvm_intrinsic(lambda address: kind(types.uintp))  # noqa: ARG005 - numba passes one
     def field(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001 - numba fixes them
         field_address = builder.add(arguments[0], context.get_constant(types.uintp, field_offset))
         return builder.load(to_pointer(builder, field_address, context.get_value_type(kind)))

@@ -75,7 +75,7 @@ f64, f32, i32, i64, u8, u64 = map(
 
 
 def named_address(name: str, address: int) -> Any:
-    """Return an intrinsic for an address of this process, which compiled code refers to by a name.
+    """Return an intrinsic for an address, to which compiled code refers by a symbol's name.
 
     Compiled code that is cached on disk then stays valid in processes with other addresses.
     """
@@ -93,7 +93,7 @@ def named_address(name: str, address: int) -> Any:
 
 @llvm_intrinsic(lambda function, *arguments: types.float64(types.uintp, types.Tuple(arguments)))
 def call(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """Call a C function at an address with arguments of exactly its types; it returns a float64."""
+    """Call the C function at an address, which returns a float64; argument types must be exact."""
     argument_types = [context.get_value_type(kind) for kind in signature.args[1]]
     function = to_pointer(
         builder,
@@ -125,8 +125,8 @@ def copy_bytes(context: Any, builder: Any, signature: Any, arguments: Any) -> An
     """Copy `count` bytes from address `source` to address `target`."""
     kind = ir.IntType(8).as_pointer()
     function = builder.module.declare_intrinsic("llvm.memcpy", [kind, kind, ir.IntType(64)])
-    to, start = (builder.inttoptr(address, kind) for address in arguments[:2])
-    builder.call(function, [to, start, arguments[2], ir.IntType(1)(0)])
+    target_pointer, source_pointer = (builder.inttoptr(address, kind) for address in arguments[:2])
+    builder.call(function, [target_pointer, source_pointer, arguments[2], ir.IntType(1)(0)])
     return context.get_dummy_value()
 
 
@@ -199,7 +199,7 @@ def _as_floats(context: Any, builder: Any, signature: Any, arguments: Any) -> li
 
 
 def callback(function: Any, return_type: Any = None, *argument_types: Any) -> Any:
-    """Wrap a compiled function of (mjModel, mjData, ...) as MuJoCo's setters take it."""
+    """Wrap a compiled function (mjModel, mjData, ...) as a pointer for MuJoCo's setters."""
     # The wrapper holds the function, whose machine code would be freed with it.
     wrapper: Any = ctypes.CFUNCTYPE(return_type, ctypes.c_void_p, ctypes.c_void_p, *argument_types)(
         function.address

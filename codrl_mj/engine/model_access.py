@@ -15,7 +15,7 @@ from codrl_mj.compile_cache import cfunc
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import call, entry_address, internal, named_address, stack_floats, u64
 
-_NO_CLAMP, _GROUPS, _LARGEST = (
+_NO_CLAMP, _NUM_GROUPS, _MAX_VALUE = (
     int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL),
     mujoco.mjNGROUP,
     mujoco.mjMAXVAL,
@@ -53,7 +53,7 @@ def command(model: int, data: int, actuator: int) -> float:
     """Return an actuator's control, clamped to its range; 0 if any control of the model is bad."""
     # As in mj_fwdActuation, where a single bad control (NaN or beyond mjMAXVAL) clears all of them.
     for control in range(MODEL.nu(model)):
-        if not abs(_clamped(model, data, control)) <= _LARGEST:
+        if not abs(_clamped(model, data, control)) <= _MAX_VALUE:
             return 0.0
     return _clamped(model, data, MODEL.actuator_ctrladr(model)[actuator])
 
@@ -62,15 +62,15 @@ def command(model: int, data: int, actuator: int) -> float:
 def is_disabled(model: int, actuator: int) -> bool:
     """Return True if an actuator's group is disabled."""
     group = MODEL.actuator_group(model)[actuator]
-    return 0 <= group < _GROUPS and (MODEL.opt.disableactuator(model) >> group) & 1 == 1
+    return 0 <= group < _NUM_GROUPS and (MODEL.opt.disableactuator(model) >> group) & 1 == 1
 
 
 @internal
 def output_inertia(model: int, data: int, output: int, gear: float) -> float:
     """Return the inertia [kg*m^2] at an output through a gear; `load_inertia` must run first.
 
-    The computation is called by its address: its compilation takes a second, which is spent only
-    for families that need the inertia.
+    The computation is called through its address, so that only families that need the inertia spend
+    the second of its compilation.
     """
     return call(u64(_function_pointer())[0], model, data, output, gear)
 
@@ -103,7 +103,7 @@ def _solve_inertia(model: int, data: int, output: int, gear: float, work: Any) -
 
 @functools.cache
 def load_inertia() -> Any:
-    """Compile the function behind `output_inertia`, once a process; return its owner.
+    """Compile the function behind `output_inertia`, once per process, and return it.
 
     The inertia is 1/(m*M^-1*m), with m = the gear times a row of `actuator_moment` and M =
     L^T*D*L, the inertia matrix that `mj_fwdPosition` has factorized. It is the inertia that the

@@ -1,12 +1,12 @@
-"""The plugin backend: functions of our MuJoCo actuator plugin, for models of any origin.
+"""The plugin backend: functions of our MuJoCo actuator plugin, for any model.
 
 numba compiles them to C functions. The model's actuator keeps its gear, gain, bias, dynamics and
 ranges: the force that the engine would have computed from them is the desired force. Several
 actuators of one joint may share an instance of the plugin. The sum of their forces is then the
-motor's command; the actuator that has the motor's parameters delivers the motor's force, and the
-others deliver none. As in the callback backend, all parameters are in the model and all state is in
-the data, here in `plugin_state`. `codrl_mj.plugin` registers the plugin and calls `start`, which
-puts these functions into it.
+motor's command. The actuator with the motor's parameters delivers the motor's force; the others
+deliver none. As in the callback backend, all parameters are in the model and all state is in the
+data, here in `plugin_state`. `codrl_mj.plugin` registers the plugin and calls `start`, which
+installs these functions.
 """
 
 import ctypes
@@ -45,8 +45,8 @@ PLUGIN_HEADER_SIZE = USER_HEADER_SIZE + 1
 EXTRA_STATES = 2
 """Number of states after the actuator's slot.
 
-The desired force [N], on the joint's side of the arm; and a flag that is 1 from a step's first call
-to its end, when further calls are stages of RK4.
+They are the desired force [N], on the joint's side of the arm, and a flag that is 1 from a step's
+first call to its end: calls in between are the later stages of RK4.
 """
 
 REASONS = (
@@ -76,7 +76,7 @@ def _slot_of(model: int, data: int, instance: int) -> int:
 
 @internal(inline="always")
 def _activation(model: int, data: int, actuator: int) -> float:
-    """Return the activation that sets the force: the present one or `mj_nextActivation`'s."""
+    """Return the activation that sets the force: the present or, if `actearly`, the next one."""
     index = MODEL.actuator_actadr(model)[actuator] + MODEL.actuator_actnum(model)[actuator] - 1
     value = DATA.act(data)[index]
     if not MODEL.actuator_actearly(model)[actuator]:
@@ -118,7 +118,7 @@ def _engine_force(model: int, data: int, actuator: int, length: float, velocity:
 
 @internal(inline="always")
 def _desired_force(model: int, data: int, motor: int, length: float, velocity: float) -> float:
-    """Return the sum of the forces of all actuators that share a motor, its shaft and its gear."""
+    """Return the summed force of all actuators that share a motor, and thus its shaft and gear."""
     force = _engine_force(model, data, motor, length, velocity)
     for partner in range(MODEL.nactuator(model)):
         if (
@@ -130,7 +130,7 @@ def _desired_force(model: int, data: int, motor: int, length: float, velocity: f
 
 
 _ATTRIBUTE = ctypes.create_string_buffer(FAMILY.encode())
-_attribute_at = named_address("codrl_mj_attribute", ctypes.addressof(_ATTRIBUTE))
+_attribute_pointer = named_address("codrl_mj_attribute", ctypes.addressof(_ATTRIBUTE))
 _get_config = library().mj_getPluginConfig
 """MuJoCo's function (model, instance, address of an attribute's name) -> address of its value."""
 _get_config.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
@@ -168,12 +168,17 @@ def _find_fault(model: int, instance: int) -> int:
             return 1
         if not is_compiled(user[2]):
             return 2
-        number = int(user[2])
-        if not has_reference(number, _get_config_compiled(model, instance, _attribute_at())):
+        family_number = int(user[2])
+        if not has_reference(
+            family_number, _get_config_compiled(model, instance, _attribute_pointer())
+        ):
             return 3
-        if width < PLUGIN_HEADER_SIZE + family_size(number, PARAMETERS):
+        if width < PLUGIN_HEADER_SIZE + family_size(family_number, PARAMETERS):
             return 4
-        if MODEL.plugin_statenum(model)[instance] != family_size(number, SLOT_SIZE) + EXTRA_STATES:
+        if (
+            MODEL.plugin_statenum(model)[instance]
+            != family_size(family_number, SLOT_SIZE) + EXTRA_STATES
+        ):
             return 5
     return 1 if num_motors == 0 else 0 if num_motors == 1 else 6
 
@@ -199,20 +204,20 @@ def compiled_entries() -> dict[str, Any]:
             if not _is_motor(model, actuator, instance) or is_disabled(model, actuator):
                 continue
             user, out = user_address(model, actuator), MODEL.actuator_outadr(model)[actuator]
-            number, arm = int(f64(user)[2]), f64(user)[USER_HEADER_SIZE]
-            slot_end = family_size(number, SLOT_SIZE)
+            family_number, arm = int(f64(user)[2]), f64(user)[USER_HEADER_SIZE]
+            slot_end = family_size(family_number, SLOT_SIZE)
             # The callback backend multiplies by the gear 1/arm. A division by the arm would differ
             # from it in the last bits.
             gear = 1.0 / arm
-            # In stages 2 to 4 of RK4 the torque is held, because a drive is sampled once a step.
+            # In stages 2 to 4 of RK4 the torque is held, because a drive is sampled once per step.
             is_in_step = states[0] < time <= states[0] + timestep and states[slot_end + 1] != 0.0
-            is_held = is_in_step and MODEL.opt.integrator(model) == _RK4 and number != _IDEAL
+            is_held = is_in_step and MODEL.opt.integrator(model) == _RK4 and family_number != _IDEAL
             if not is_held:
                 length = DATA.actuator_length(data)[out]
                 velocity = DATA.actuator_velocity(data)[out]
                 # The time of the committed state is set too, in case the user has changed the time.
                 states[0] = time
-                is_motion, force = family_size(number, MOTION) != 0, 0.0
+                is_motion, force = family_size(family_number, MOTION) != 0, 0.0
                 if is_motion:
                     desired = command(model, data, actuator) * gear
                 else:
@@ -220,11 +225,11 @@ def compiled_entries() -> dict[str, Any]:
                     desired = force * arm
                 inertia = (
                     output_inertia(model, data, out, gear)
-                    if family_size(number, INERTIA)
+                    if family_size(family_number, INERTIA)
                     else math.inf
                 )
                 advance_slot(
-                    *(number, user + 8 * PLUGIN_HEADER_SIZE, timestep, slot, desired),
+                    *(family_number, user + 8 * PLUGIN_HEADER_SIZE, timestep, slot, desired),
                     *(length * gear, velocity * gear, time, inertia),
                 )
                 states[slot_end], states[slot_end + 1] = (
@@ -237,12 +242,12 @@ def compiled_entries() -> dict[str, Any]:
     def advance(model: int, data: int, instance: int) -> None:
         for actuator in range(MODEL.nactuator(model)):
             if _is_motor(model, actuator, instance):
-                number, slot = (
+                family_number, slot = (
                     int(f64(user_address(model, actuator))[2]),
                     _slot_of(model, data, instance),
                 )
-                commit_slot(number, slot, DATA.time(data))
-                f64(slot)[family_size(number, SLOT_SIZE) + 1] = 0.0
+                commit_slot(family_number, slot, DATA.time(data))
+                f64(slot)[family_size(family_number, SLOT_SIZE) + 1] = 0.0
 
     @cfunc(
         types.void(types.uintp, types.uintp, types.uintp, types.int32),
@@ -269,7 +274,7 @@ def compiled_entries() -> dict[str, Any]:
 def start(model: int, data: int, instance: int) -> int:
     """Run the plugin's first `init`, with addresses of mjModel and mjData.
 
-    It replaces the plugin's Python functions by the compiled ones, which MuJoCo calls from then on.
+    From then on MuJoCo calls the compiled functions instead of the plugin's Python functions.
     """
     del data
     structure = registered_plugins()[NAME][1]
@@ -295,7 +300,7 @@ def _family(model: int, instance: int) -> Any:
         if import_path(family) == name:
             return family
     raise ValueError(
-        f"its family {name!r} is not loaded, and a model cannot have it imported: import its"
+        f"its family {name!r} is not loaded, and a model must not import code: import its"
         " module and call codrl_mj.engine.load_family with it before you load the model"
     )
 

@@ -1,4 +1,4 @@
-"""Readout of our actuators from compiled models and their data, for both backends."""
+"""Readout of our actuators from compiled models and their data, with either backend."""
 
 import numbers
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -107,8 +107,8 @@ def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:
         )
         if name != import_path(family):
             raise ValueError(
-                f"{FAMILY} = {name!r} of its plugin: must be {import_path(family)!r}, as in its user"
-                " data"
+                f"{FAMILY} = {name!r} of its plugin: must be {import_path(family)!r}, as in its"
+                " user data"
             )
         if model.plugin_statenum[instance] != size + EXTRA_STATES:
             raise ValueError(REASONS[5])
@@ -211,15 +211,15 @@ def check_shafts(
 ) -> float:
     """Raise an error if actuators are unstable with the joints that they move.
 
-    The check linearizes the joints at the model's step and initial position. It ignores gravity,
+    The check linearizes joints and actuators at the model's initial position. It ignores gravity,
     springs, contacts, limits and the model's own servos.
 
     Args:
         model: a compiled model.
-        allow_unstable: return instead of raising an error.
-        held: the actuators do not know the inertia, so they hold the speed over a step.
+        allow_unstable: True to return instead of raising an error.
+        held: True if actuators are not given the inertia, and hold the speed over a step.
         actuators: actuators by index; the model's own if None.
-        explicit: positions are integrated with the previous speeds, as in explicit Euler.
+        explicit: True if positions are integrated with the previous speeds (explicit Euler).
 
     Returns:
         The spectral radius of all position and speed loops together; 0 if there are none.
@@ -227,26 +227,26 @@ def check_shafts(
     Raises:
         UnstableError: the loops are unstable; the message has the spectral radius and a remedy.
     """
-    closed = {
+    loop_actuators = {
         index: actuator
         for index, actuator in (actuators or motors(model)).items()
         if actuator.closes_loops
     }
-    if not closed:
+    if not loop_actuators:
         return 0.0
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
     shafts, inertias = (
-        [(model.actuator_trntype[index], *model.actuator_trnid[index]) for index in closed],
+        [(model.actuator_trntype[index], *model.actuator_trnid[index]) for index in loop_actuators],
         [],
     )
-    names = [model.actuator(index).name or f"actuator {index}" for index in closed]
-    for (index, actuator), shaft, name in zip(closed.items(), shafts, names, strict=True):
+    names = [model.actuator(index).name or f"actuator {index}" for index in loop_actuators]
+    for (index, actuator), shaft, name in zip(loop_actuators.items(), shafts, names, strict=True):
         # In the callback backend the arm is part of the gear.
         arm = 1.0 if model.actuator_plugin[index] < 0 else actuator.arm_radius
         inertias.append(shaft_inertia(model, data, model.actuator_outadr[index], 1.0 / arm))
         try:
-            # Motors on the same shaft share its inertia, and none of them knows of the others.
+            # Motors on the same shaft share its inertia, and each is checked without the others.
             num_on_shaft = shafts.count(shaft)
             actuator.check_shaft(
                 model.opt.timestep, inertias[-1] / num_on_shaft, num_on_shaft > 1 or held
@@ -254,20 +254,21 @@ def check_shafts(
         except UnstableError as error:
             if not allow_unstable:
                 raise UnstableError(f"{name}: {error}") from None
-    spectral_radius, linear = _loop_radius(model, data, closed, inertias, held, explicit)
+    spectral_radius, linear = _loop_radius(model, data, loop_actuators, inertias, held, explicit)
     step = model.opt.timestep
     largest = spectral_radius(step)
     if largest < MAX_STABLE_RADIUS or allow_unstable:
         return largest
-    separate_radii = {number: spectral_radius(step, number) for number in linear}
+    separate_radii = {position: spectral_radius(step, position) for position in linear}
     worst = max(separate_radii, key=separate_radii.__getitem__)
     coupled = separate_radii[worst] < MAX_STABLE_RADIUS
-    remedy = list(closed.values())[worst].loop_remedy(inertias[worst])
+    remedy = list(loop_actuators.values())[worst].loop_remedy(inertias[worst])
     raise UnstableError(
-        f"{', '.join(names[number] for number in linear) if coupled else names[worst]}: the outer"
-        f" loops are unstable{' together' * coupled}: spectral radius {largest:.4g} over a"
+        f"{', '.join(names[position] for position in linear) if coupled else names[worst]}: the"
+        f" outer loops are unstable{' together' * coupled}: spectral radius {largest:.4g} over a"
         f" mechanical step of {step:g} s, must be < 1. {remedy}"
-        f" {_shorter_step(closed.values(), spectral_radius, step)}; or pass allow_unstable=True"
+        f" {_shorter_step(loop_actuators.values(), spectral_radius, step)}; or pass"
+        " allow_unstable=True"
     )
 
 
@@ -279,10 +280,10 @@ def _loop_radius(
     held: bool,
     explicit: bool,
 ) -> tuple[Callable[..., float], list[int]]:
-    """Return the function of the spectral radius, and the numbers of the actuators that are linear.
+    """Return a function for the spectral radius, and the positions of the linear actuators.
 
-    The function takes a step [s] and the numbers of the actuators whose loops are closed; all
-    linear ones if none is given. An actuator's number is its position in `actuators`.
+    The function takes a step [s] and the positions in `actuators` of those whose loops are closed;
+    without positions, the loops of all linear actuators are closed.
     """
     joints, motors = _joints(model, data, actuators, explicit), list(actuators.values())
     advances = [motor.advance if held else compiled_advance(type(motor)) for motor in motors]
@@ -291,28 +292,28 @@ def _loop_radius(
         for motor, inertia in zip(motors, inertias, strict=True)
     ]
 
-    def linearized(number: int, timestep: float, size: float = 1.0) -> np.ndarray:
+    def linearized(position: int, timestep: float, size: float = 1.0) -> np.ndarray:
         change = size * stability.PERTURBATION
         return stability.linearize(
-            motors[number], advances[number], timestep, known_inertias[number], change
+            motors[position], advances[position], timestep, known_inertias[position], change
         )
 
-    def is_smooth(number: int) -> bool:
-        small, large = (linearized(number, model.opt.timestep, size) for size in (1.0, 10.0))
+    def is_smooth(position: int) -> bool:
+        small, large = (linearized(position, model.opt.timestep, size) for size in (1.0, 10.0))
         return np.allclose(small, large, rtol=0.01, atol=1e-6 * np.abs(small).max())
 
-    def spectral_radius(timestep: float, *numbers: int) -> float:
-        chosen = list(numbers or linear)
-        loops = [linearized(number, timestep) for number in chosen]
+    def spectral_radius(timestep: float, *positions: int) -> float:
+        chosen = list(positions or linear)
+        loops = [linearized(position, timestep) for position in chosen]
         shafts = joints._replace(moments=joints.moments[chosen])
         return stability.loop_radius(shafts, loops, timestep) if chosen else 0.0
 
     # A custom family may have friction or backlash at rest, which a linearized loop cannot
     # describe.
     linear = [
-        number
-        for number, motor in enumerate(motors)
-        if type(motor) in BUILT_IN or is_smooth(number)
+        position
+        for position, motor in enumerate(motors)
+        if type(motor) in BUILT_IN or is_smooth(position)
     ]
     return spectral_radius, linear
 
@@ -327,7 +328,7 @@ Joints without any force have a radius of 1, and rounding may raise it.
 def _shorter_step(
     actuators: Collection[ActuatorModel], radius_at: Callable[[float], float], timestep: float
 ) -> str:
-    """Return a sentence on the longest of some shorter steps [s] at which the loops are stable."""
+    """Return a remedy: the longest of some shorter steps [s] at which the loops are stable."""
     for parts in (2, 3, 4, 5, 8, 10, 16, 20, 32, 50, 100):
         try:
             for actuator in actuators:
@@ -336,8 +337,8 @@ def _shorter_step(
             continue
         if (radius := radius_at(timestep / parts)) < MAX_STABLE_RADIUS:
             return (
-                f"Or shorten the step to {timestep / parts:g} s, which does (spectral radius"
-                f" {radius:.4g})"
+                f"Or shorten the step to {timestep / parts:g} s, which makes them stable"
+                f" (spectral radius {radius:.4g})"
             )
     return "A shorter step does not help"
 
@@ -393,18 +394,18 @@ class Readout:
         indices = np.array(list(self.motors), dtype=int)
         families: list[Family] = [type(actuator) for actuator in self.motors.values()]
         out, instances = model.actuator_outadr[indices], model.actuator_plugin[indices]
-        uses_plugin, tracks = (
+        uses_plugin, torque_controlled = (
             instances >= 0,
             np.array([family.is_torque_controlled for family in families], dtype=bool),
         )
         self._plugin_use = uses_plugin.all(), uses_plugin.any()
-        # Indices count in the vector of `table`: activations, plugin states, or, if the model has
-        # motors in both backends, the former followed by the latter.
+        # Indices refer to the vector that `table` reads: activations, plugin states, or, if the
+        # model has motors in both backends, the activations followed by the plugin states.
         in_plugin = model.plugin_stateadr[instances] if model.nplugin else 0
         first = 0 if uses_plugin.all() else model.na
         starts = np.where(uses_plugin, first + in_plugin, model.actuator_actadr[indices])
         last = np.array([slot_size(family) for family in families], dtype=int)
-        desired = np.where(uses_plugin & tracks, starts + last, -1)
+        desired = np.where(uses_plugin & torque_controlled, starts + last, -1)
         columns = {"desired_force": desired, "actual_force": np.full(len(families), -1)}
         for motor, (start, family) in enumerate(zip(starts, families, strict=True)):
             for column, name in enumerate(family.Signals._fields, start + signals_offset(family)):
@@ -420,7 +421,7 @@ class Readout:
         # In the callback backend the arm is part of the gear, and forces are those of the shaft.
         self._in_callback = np.flatnonzero(~uses_plugin)
         self._gear = np.where(uses_plugin, 1.0, model.actuator_gear[out, 0])
-        self._command_is_desired = np.flatnonzero(~uses_plugin & tracks)
+        self._command_is_desired = np.flatnonzero(~uses_plugin & torque_controlled)
         self._control = model.actuator_ctrladr[indices[self._command_is_desired]]
         limited = model.actuator_ctrllimited[self._control].astype(bool)
         low, high = model.actuator_ctrlrange[self._control].T

@@ -1,4 +1,4 @@
-"""Addition of our actuators to MuJoCo models of any origin: `add_motors`."""
+"""Addition of our actuators to any MuJoCo model: `add_motors`."""
 
 import re
 import sys
@@ -41,7 +41,7 @@ _BIASES = {mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE}
 
 
 class MotorWarning(UserWarning):
-    """Warning that a model may contain its motors already, or move its joints past them."""
+    """Warning that a model already has a motor's dynamics, or forces that bypass a motor."""
 
 
 class AddedMotor(NamedTuple):
@@ -116,7 +116,7 @@ def add_motors(
         _remove_dynamics(result, model, index, actuator)
     for motor in added:
         _add_motor(result, model, motor)
-    # With -1 the compiler finds the number of user entries that the motors need.
+    # With -1 the compiler computes the number of user entries that the motors need.
     result.nuser_actuator = -1
     if any(actuator.closes_loops for actuator in motor_of.values()):
         check_shafts(result.compile(), allow_unstable)
@@ -154,7 +154,7 @@ def resolve_patterns(actuators: Mapping[str, Any], owner: str) -> dict[str, Actu
 
 
 def split_pattern(pattern: str) -> list[str]:
-    """Return the patterns that a pattern joins by `&`, or a list of the pattern itself."""
+    """Split a pattern at `&` into the patterns that it joins."""
     # A regular expression may contain an ampersand as "\\&".
     return [part.strip() for part in re.split(r"(?<!\\)&", pattern)]
 
@@ -247,7 +247,7 @@ def _refusal_together(
     pattern: str,
     actuator: ActuatorModel,
 ) -> str:
-    """Return the reason why a pattern cannot have its matches at one joint; empty if it can."""
+    """Return why a pattern's matches at one joint cannot share a motor; empty if they can."""
     descriptions, is_joined = (
         [_describe(spec.actuators[index], index) for index in indices],
         len(split_pattern(pattern)) > 1,
@@ -286,7 +286,7 @@ def _refusal_together(
 def _refusal(
     model: mujoco.MjModel, target: mujoco.MjsActuator, index: int, actuator: ActuatorModel
 ) -> str:
-    """Return the reason why an actuator of a model cannot have a motor; empty if it can."""
+    """Return why an actuator of a model cannot have a motor; empty if it can."""
     transmission, dynamics = (
         mujoco.mjtTrn(model.actuator_trntype[index]),
         mujoco.mjtDyn(model.actuator_dyntype[index]),
@@ -422,14 +422,14 @@ def _connect(
 _DYNAMICS_NAMES = "armature", "damping", "frictionloss"
 """MuJoCo's names for the entries of `JointAdditions`."""
 _NEGLIGIBLE = 0.05
-"""Share of a motor's value up to which the model's value is taken to be the bearing's.
+"""Largest ratio of the model's value to the motor's that causes no warning.
 
-Counting it twice would change little.
+So small a value is probably the bearing's, and counting it twice changes little.
 """
 
 
 def _added_dynamics(actuator: ActuatorModel, gear: float = 1.0) -> JointAdditions:
-    """Return what a motor adds to its joint through a gear; its back-EMF counts as damping."""
+    """Return a motor's additions to its joint through a gear; back-EMF counts as damping."""
     armature, damping, friction = actuator.additions
     return JointAdditions(
         gear**2 * armature, gear**2 * (damping + actuator.back_emf_damping), abs(gear) * friction
@@ -439,7 +439,7 @@ def _added_dynamics(actuator: ActuatorModel, gear: float = 1.0) -> JointAddition
 def _remove_dynamics(
     spec: mujoco.MjSpec, model: mujoco.MjModel, index: int, actuator: ActuatorModel
 ) -> None:
-    """Remove from a spec the armature, damping and friction that a motor replaces by its own."""
+    """Remove from a spec the armature, damping and friction that a motor replaces."""
     target, transmission = spec.actuators[index], mujoco.mjtTrn(model.actuator_trntype[index])
     elements = [target]
     if transmission in (*ON_JOINT, mujoco.mjtTrn.mjTRN_TENDON):
@@ -453,10 +453,10 @@ def _remove_dynamics(
 def describe_duplicate_dynamics(
     model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]
 ) -> list[str]:
-    """Describe the damping, armature and friction of a model that may be a motor's already.
+    """Describe damping, armature and friction of a model that a motor probably adds again.
 
     Args:
-        model: the model without what its motors add.
+        model: the model without its motors' additions.
         motors: index of an actuator -> motor.
 
     Returns:
@@ -515,9 +515,9 @@ def _describe_bypasses(model: mujoco.MjModel, added: Sequence[AddedMotor]) -> li
         ]
         if joint is not None and beside:
             texts.append(
-                f"actuator {beside[0]} drives the joint of {names[first]} past its motor:"
-                f" '{names[first]} & {beside[0]}' puts one motor behind both; 'ideal' leaves the"
-                " other as it is, without this warning"
+                f"actuator {beside[0]} drives the joint of {names[first]} without its motor:"
+                f" '{names[first]} & {beside[0]}' puts one motor behind both; the motor 'ideal' for"
+                f" {beside[0]} leaves it as it is, without this warning"
             )
         if joint is not None and model.jnt_actgravcomp[joint] and model.body_gravcomp.any():
             texts.append(
@@ -542,7 +542,7 @@ _INNER_PACKAGES = {"codrl_mj", "gymnasium", "dm_control", "contextlib"}
 
 
 def _warn(text: str) -> None:
-    """Warn once a process, at the user's line."""
+    """Warn once per process, at the user's line."""
     # Environments build the same model repeatedly, and Python's filter counts by line.
     frame, level = sys._getframe(), 1
     while (

@@ -1,4 +1,4 @@
-"""Gymnasium environments of tasks and their physics; the classes are imported on first use."""
+"""Gymnasium environments with motors; the classes are imported on first use."""
 
 import importlib
 from typing import Any

@@ -1,7 +1,7 @@
 """Gymnasium's attributes of environments, for example `env.unwrapped.gravity = 3.7`.
 
-`Task.attributes` maps each name to the quantity that it reads and writes; on the analytic physics,
-numbers of the model are those of Gymnasium's own environment. A written attribute takes effect at
+`Task.attributes` maps each name to the quantity that it reads and writes; with the analytic
+physics, numbers of the model belong to Gymnasium's environment. A written attribute takes effect at
 once; the state and the motor stay as they are. Written values outlast resets and are not part of a
 `snapshot`. Values that the task's compiled functions contain are read-only; writing the value that
 an attribute already has is always allowed.
@@ -32,7 +32,7 @@ def read(name: str, setup: ResolvedEnv, model: Any) -> Any:
     """Return an attribute's value.
 
     Args:
-        name: the attribute.
+        name: name of the attribute.
         setup: the environment's resolved configuration.
         model: the `mjModel` of its simulation; the `Physics` if it has no MuJoCo model.
     """
@@ -62,8 +62,8 @@ def write(name: str, value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
     present, attribute = read(name, setup, model), setup.task.attributes[name]
     if np.array_equal(value, present):
         return setup
-    # The functions below raise only the remedy, or the values that are allowed; the attribute's
-    # name and value are put in front of it at the end.
+    # The functions below raise errors with only the remedy or the allowed values. The handlers at
+    # the end put the attribute's name and value in front.
     try:
         if isinstance(attribute, Fixed):
             raise AttributeError(attribute.remedy)
@@ -156,17 +156,13 @@ def _write_number(
         shown_fields = attribute.only or fields
         write_fields(
             model,
-            {
-                attribute_name: rows
-                for attribute_name, rows in fields.items()
-                if attribute_name in shown_fields
-            },
+            {field: rows for field, rows in fields.items() if field in shown_fields},
         )
     _number_view(attribute, model)[0] = (number / attribute.scale) ** power
 
 
 def _write_forces(value: Any, setup: ResolvedEnv, model: Any, per_action: bool) -> ResolvedEnv:
-    """Write the force of each action, or the largest force, to which the others are scaled."""
+    """Write the forces of all actions, or the largest force, with which the others are scaled."""
     task = setup.task
     if (
         setup.config.action != "force"

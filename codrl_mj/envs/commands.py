@@ -21,7 +21,7 @@ POSITIONS = ("rad", "m")
 
 
 def command_of(actuator: ActuatorModel, name: str, pattern: str = "") -> Command:
-    """Return an action's meaning for an actuator; messages name its motors by `pattern`."""
+    """Return an actuator's `Command` of this name; `pattern` names its motors in messages."""
     if name == "force":
         return Command("N or N*m", actuator, actuator.arm_radius, None, {})
     known = actuator.commands()
@@ -45,14 +45,14 @@ def command_of(actuator: ActuatorModel, name: str, pattern: str = "") -> Command
 
 
 def _servo_remedy(actuator: ActuatorModel, name: str) -> str:
-    """Return how to make a motor take this command; empty for other actuators and commands."""
+    """Return a remedy, for drives that do not take position or velocity commands; else empty."""
     if name not in ("position", "velocity") or not isinstance(actuator, Drive):
         return ""
     changes = {} if isinstance(actuator, Servo) else {"family": "servo"}
     changes |= {"loop.controls": name} if isinstance(actuator, Servo) or name == "velocity" else {}
     flags = " ".join(f"--actuator.{field} {value}" for field, value in changes.items())
     fields = " and ".join(f"{field} = {value!r}" for field, value in changes.items())
-    return f"for a {name} of the same motor set {fields} over it ({flags})"
+    return f"to command the {name} of the same motor, set {fields} ({flags})"
 
 
 class TaskCommands:
@@ -71,7 +71,8 @@ class TaskCommands:
             task: the task.
             actuators: its actuators.
             name: `force`, or another command of the actuators.
-            levels: choices of a discrete task, for commands other than `force`.
+            levels: levels that the actions of a discrete task select, for commands other than
+                `force`.
         """
         if name == "force" and actuators[0].MOTION:
             raise ValueError(
@@ -103,13 +104,15 @@ class TaskCommands:
         limits = [command.limit for command in chosen]
         if not all(limit is None or np.isfinite(limit) for limit in limits):
             raise ValueError(f"action = {name!r}: needs a finite controller.max_voltage, it is inf")
-        self.holds = np.where([command.unit in POSITIONS for command in chosen], scales, 0.0)
+        self.force_per_position = np.where(
+            [command.unit in POSITIONS for command in chosen], scales, 0.0
+        )
         """As `codrl_mj.physics.SimulationConfig.force_per_position`."""
         motors = zip(limits, scales, task.max_forces, strict=True)
         self.max_forces = np.array(
             [max_force if limit is None else limit * scale for limit, scale, max_force in motors]
         )
-        """Largest forces [N] or torques [N*m] that the physics is asked for, shape (n,)."""
+        """Largest forces [N] or torques [N*m] that commands can request, shape (n,)."""
         # Actions are clipped in float64, because rounding may put float32 bounds beyond the limit.
         max_commands = self.max_forces / scales
         self._box = (
@@ -222,9 +225,9 @@ def _discrete_levels(
 class ControlCommands:
     """Conversion from actions to the controls of any model, with units, limits and disturbances.
 
-    Actions of actuators without our motors pass unchanged. Disturbances act once per environment
-    step, in place of the integration step: on a plain motor's force [N or N*m] before the gear, and
-    on the control itself of other actuators.
+    Actions of actuators without our motors pass unchanged. Disturbances are computed once per
+    environment step, not per integration step. They change the force [N or N*m] of a plain motor
+    before the gear, and the control of other actuators.
     """
 
     def __init__(
@@ -240,7 +243,7 @@ class ControlCommands:
         Args:
             data: the simulation; its model is changed.
             actions: the environment's original action space.
-            motors: actuator index -> command; None if the action stays the environment's own.
+            motors: actuator index -> command; None if the action stays as it is.
             disturbances: disturbances of the commands and the joints.
             step_duration: duration of an environment step [s]; None if unknown.
         """
@@ -290,12 +293,12 @@ class ControlCommands:
             disturbances, step_duration, max_controls * np.abs(self._gains), 1
         )
         actuators = motors_of(model)
-        holds = [
-            _hold(model, actuator, actuators[index])
+        holding_controls = [
+            _holding_control(model, actuator, actuators[index])
             for index in indices
             for actuator in actuators_sharing_motor(model, index)
         ]
-        self._holds = np.array(holds).reshape(-1, 2).T
+        self._holding_controls = np.array(holding_controls).reshape(-1, 2).T
         self._outputs = model.actuator_outadr[actuator_indices]
         # Loads act on joints, one per motor; commands exist for each actuator that shares a motor.
         self._dofs = [_dof(model, index) for index in indices] if self._pulses else []
@@ -351,14 +354,14 @@ class ControlCommands:
         return {"disturbances": self._disturber.memory} if self._disturber.enabled else {}
 
     def begin(self, key: float) -> None:
-        """Reset at the start of an episode that has this key of random numbers."""
+        """Reset at the start of an episode with this random key."""
         if self._disturber.enabled:
             self._disturber.reset(np.zeros(1, dtype=int), key, self._holding_commands())
             self._data.qfrc_applied[self._dofs] = 0.0
 
     def _holding_commands(self) -> Any:
         """Return the commands that hold the motors in place: 0 unless commands are positions."""
-        slopes, offsets = self._holds * self._gains
+        slopes, offsets = self._holding_controls * self._gains
         if not slopes.any():
             return 0.0
         # Not every environment updates the actuators' lengths at a reset. The copy leaves the
@@ -402,8 +405,10 @@ def _dof(model: mujoco.MjModel, index: int) -> int:
     return int(model.jnt_dofadr[model.actuator_trnid[index, 0]])
 
 
-def _hold(model: mujoco.MjModel, index: int, actuator: ActuatorModel) -> tuple[float, float]:
-    """Return slope and offset over the length of the control that holds an actuator in place.
+def _holding_control(
+    model: mujoco.MjModel, index: int, actuator: ActuatorModel
+) -> tuple[float, float]:
+    """Return slope and offset, as a function of length, of the control that holds an actuator.
 
     Both are 0 if the control is a force.
     """

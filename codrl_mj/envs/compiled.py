@@ -46,7 +46,7 @@ class VectorStep(NamedTuple):
     """Inputs and outputs of one environment step of many environments."""
 
     forces: np.ndarray
-    """Desired [N or N*m], shape (N,) or (N, motors)."""
+    """Desired forces [N or N*m], shape (N,) or (N, motors)."""
     stepping: np.ndarray
     """True for environments that step, shape (N,), bool; the others are reset instead."""
     observations: np.ndarray
@@ -115,7 +115,7 @@ def compiled_env(env: Any) -> CompiledEnv | None:
 
     Returns:
         None if a part of the environment runs in Python: a physics without compiled steps, such as
-        the analytic one, or an actuator or model that is randomized at resets.
+        the analytic one, or the randomization of actuators and models at resets.
     """
     setup, physics = env.setup, env.physics
     if physics.stepping is None or setup.randomization.distributions:
@@ -147,10 +147,15 @@ def compiled_kernels(setup: ResolvedEnv, physics: Any) -> Kernels:
     """Return the functions for environments of one kind; they are compiled once per process."""
     task = setup.task
     sensors = len(setup.simulation.family.OBSERVED) if setup.sensors else 0
-    single, size = len(task.motors) == 1, len(task.state_names)
+    has_single_motor, size = len(task.motors) == 1, len(task.state_names)
     sizes = size, len(setup.observation_names), len(setup.config.options)
     return _kernels(
-        physics.stepping, compiled_outcomes(task), task.initial_state, single, sensors, *sizes
+        physics.stepping,
+        compiled_outcomes(task),
+        task.initial_state,
+        has_single_motor,
+        sensors,
+        *sizes,
     )
 
 
@@ -159,15 +164,15 @@ def _kernels(
     stepping: Stepping,
     outcomes: Outcomes,
     initial_state: Callable[..., Any],
-    single: bool,
+    has_single_motor: bool,
     sensors: int,
     size: int,
     observation_size: int,
     options_size: int,
 ) -> Kernels:
     advance, start, read, read_sensors = stepping
-    observe, rewarded, ended = outcomes.observe, outcomes.reward, outcomes.terminated
-    compiled = njit(nogil=True, error_model="numpy")
+    observe, reward_of, is_terminated = outcomes.observe, outcomes.reward, outcomes.terminated
+    jit = njit(nogil=True, error_model="numpy")
     initial_entries = internal(initial_state)
 
     @internal
@@ -183,7 +188,7 @@ def _kernels(
                 for entry in range(sensors):
                     observation[first + motor * sensors + entry] = sensor_values[motor, entry]
 
-    @compiled
+    @jit
     def step(force: Any, pointers: int) -> tuple[float, bool, bool]:
         before, after = (
             numba.carray(stack_floats(size), size),
@@ -197,11 +202,11 @@ def _kernels(
         options = numba.carray(f64(i64(pointers)[OPTIONS] + 8 * FIRST_OPTION), options_size)
         # The condition is constant at compilation: one motor's force is a number, several are an
         # array.
-        if single:
-            return rewarded(before, last[0, 1], after, options), ended(after), is_finite
-        return rewarded(before, last[:, 1], after, options), ended(after), is_finite
+        if has_single_motor:
+            return reward_of(before, last[0, 1], after, options), is_terminated(after), is_finite
+        return reward_of(before, last[:, 1], after, options), is_terminated(after), is_finite
 
-    @compiled
+    @jit
     def reset(
         generator: np.random.Generator, low: np.ndarray, high: np.ndarray, pointers: int
     ) -> None:
@@ -244,7 +249,7 @@ def _kernels(
                     signals[column, row, motor] = last[motor, 1 + column]
         return num_diverged
 
-    @compiled
+    @jit
     def observe_rows(indices: np.ndarray, lane: Any, rows: Any, observations: np.ndarray) -> None:
         lane, rows = Lane(*lane), Rows(*rows)
         no_signals, state = np.zeros(lane.trace.shape[1:]), np.empty(size)

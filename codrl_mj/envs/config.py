@@ -1,7 +1,7 @@
 """Complete configuration of an environment; it builds environments and is stored in run folders.
 
-The command line makes its flags from it. The module is light: it compiles nothing and loads no
-engine.
+The command line derives its flags from the fields. Importing this module is fast: it compiles
+nothing and does not load MuJoCo.
 """
 
 import dataclasses
@@ -35,13 +35,13 @@ class EnvConfig:
     env source.
     """
     actuator: Any = "default"
-    """Actuator that transmits the force. A name (`default`, the task's own: the paper's if it has
-    one; `ideal`, `paper`, `weak`, `weaker`, `open_loop`, or the name of a family or a motor), an
-    `ActuatorModel`, a mapping of its fields (`name` selects the actuator that they modify), a file
-    with such a mapping, `module:NAME`, or None (ideal). All motors get the same actuator, or a
-    mapping of name patterns to actuators assigns them; for a task also a list with one for each
-    motor. Stored as an `ActuatorModel`, as a tuple for a task with several motors, or as a mapping
-    of patterns for a third-party environment.
+    """Actuator that transmits the force. A name (`default`: the task's default, which is the
+    paper's actuator if there is one; `ideal`, `paper`, `weak`, `weaker`, `open_loop`; or the name
+    of a family or a motor), an `ActuatorModel`, a mapping of its fields (`name` selects the
+    actuator that they modify), a file with such a mapping, `module:NAME`, or None (ideal). All
+    motors get the same actuator, or a mapping of name patterns to actuators assigns them; for a
+    task also a list with one for each motor. Stored as an `ActuatorModel`, as a tuple for a task
+    with several motors, or as a mapping of patterns for a third-party environment.
     """
     physics: str = "mujoco"
     """`mujoco`; `analytic` (Gymnasium's equations; Furuta: a closed form); or a registered name."""
@@ -54,14 +54,16 @@ class EnvConfig:
     timestep: float | None = None
     """Integration step [s], instead of inner_steps; it must divide the environment step."""
     action: str = "force"
-    """Command of the agent: the desired `force` (as in the paper; in a third-party environment its
-    own actions), the reference `current`, the terminal `voltage` without the controller, or another
-    command of the actuator's family.
+    """Meaning of the agent's action: the desired `force` (as in the paper; actions of a third-party
+    environment stay unchanged), the reference `current`, the terminal `voltage` without the
+    controller, or another command of the actuator's family.
     """
     levels: tuple[float, ...] | None = None
     """Levels of current [A] or voltage [V] that the actions of a discrete task choose from."""
     observe_actuator: bool = False
-    """True to also observe measured and reference current [A], or the motors' other sensors."""
+    """True to append the motors' sensors to observations: for a current loop, the measured and the
+    reference current [A].
+    """
     max_episode_steps: int | None = None
     """Time limit [environment steps], >= 1; default: the environment's own."""
     allow_unstable: bool = False
@@ -71,9 +73,9 @@ class EnvConfig:
     joint: Joint = UNMODIFIED_JOINT
     """Damping, friction and armature that are added to the actuated joints."""
     joint_dynamics: str | None = None
-    """Treatment of damping, armature and frictionloss in a third-party model whose motors add the
-    same: `keep` adds both, `replace` removes the model's, which then come from the motors alone;
-    None keeps them and warns.
+    """Treatment of damping, armature and frictionloss in a third-party model if its motors have the
+    same quantities: `keep` adds both; `replace` removes the model's values; None adds both and
+    warns.
     """
     randomize: tuple[str, ...] | None = None
     """Fields to draw at every reset, as FIELD=DISTRIBUTION, such as
@@ -125,13 +127,13 @@ class EnvConfig:
 
     @classmethod
     def from_arguments(cls, task: str, actuator: Any, arguments: Mapping[str, Any]) -> "EnvConfig":
-        """Return the configuration that keyword arguments of an environment's class describe.
+        """Create a configuration from keyword arguments of an environment class.
 
         Args:
             task: name of the task or env source.
             actuator: value of the field of this name.
-            arguments: other fields and the options, each by its name or as `options`; a time limit
-                is not among them, because the caller handles it.
+            arguments: other fields and the options, each by its name or as `options`; no time
+                limit, which the caller handles.
 
         Raises:
             UnknownOptionError: a name is neither a field nor an option.
@@ -198,7 +200,7 @@ class EnvConfig:
 
     @property
     def action_space(self) -> "gymnasium.spaces.Space[Any]":
-        """Action space without motors; the space with other commands has the same kind."""
+        """Action space without motors; other commands change its bounds or size, not its type."""
         return self.source.action_space(self)
 
     @property
@@ -210,7 +212,7 @@ class EnvConfig:
 
     @property
     def policy_fields(self) -> dict[str, Any]:
-        """Fields that a policy depends on: what it commands and observes cannot change later."""
+        """Fields that define a policy's actions and observations; they cannot change later."""
         return {name: getattr(self, name) for name in ("action", "levels", "observe_actuator")}
 
     def as_arguments(self) -> dict[str, Any]:
@@ -245,7 +247,8 @@ class EnvConfig:
 
     def make_vec(self, num_envs: int = 1, **arguments: Any) -> Any:
         """Build N environments as a Gymnasium vector environment; see `codrl_mj.make_vec`."""
-        # A list is not a value of the field: it holds an actuator for each environment.
+        # A list holds one actuator per environment, so it is not a value of the field `actuator`
+        # and bypasses `override`.
         actuators_per_env = {
             name: arguments.pop(name)
             for name in ("actuator",)
@@ -273,7 +276,7 @@ class EnvConfig:
 
     @classmethod
     def from_mapping(cls, mapping: Any, base: "EnvConfig | None" = None) -> "EnvConfig":
-        """Return the configuration that a mapping describes: all fields, or some of them.
+        """Create a configuration from a mapping of all fields or some of them.
 
         Args:
             mapping: the fields; options of a task may be listed among them.
@@ -289,7 +292,7 @@ class EnvConfig:
             raise ValueError(f"env = {mapping!r}: must be a mapping of the environment's arguments")
         fields = dict(mapping) if base is None else {"task": base.task, **mapping}
         if "task" not in fields:
-            raise ValueError("it has no task")
+            raise ValueError("env.task: is missing: name a task, such as 'cartpole'")
         source = find_source(fields["task"])
         option_names = source.option_names
         check_names(

@@ -2,7 +2,7 @@
 
 A path is `[PATTERN:]FIELD` for actuators (all of them if there is no pattern) or `model.FIELD`. A
 distribution is a pure function of draws in [0, 1): the same draw always gives the same value.
-`str` writes a distribution exactly as `parse` reads it: `uniform(0.05, 0.2)`, `loguniform(0.1,
+`str` returns a distribution as text that `parse` reads: `uniform(0.05, 0.2)`, `loguniform(0.1,
 10.0)`, `choice(1, 2)`.
 """
 
@@ -162,7 +162,7 @@ _FORMS = {
 
 
 def parse(text: str) -> Distribution:
-    """Read a distribution as `str` writes it; the text is never evaluated as code.
+    """Parse the text of a distribution, as `str` returns it, without evaluating it as code.
 
     Args:
         text: `uniform(LOW, HIGH)`, `loguniform(LOW, HIGH)` or `choice(VALUE, ...)`. A value is a

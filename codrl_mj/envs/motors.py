@@ -1,4 +1,4 @@
-"""The motors in one simulation of any model: their commands, randomization and signals."""
+"""Motors in a simulation of any model: their commands, randomization and signals."""
 
 import dataclasses
 import functools
@@ -37,7 +37,7 @@ class MotorSettings:
     actuators: Mapping[str, ActuatorModel]
     """Pattern of actuators' names -> actuator."""
     action: str = "force"
-    """Command that an action is."""
+    """Command that an action represents."""
     observe_actuator: bool = False
     """True to append the values of the motors' sensors to observations."""
     randomize: Any = None
@@ -51,7 +51,7 @@ class MotorSettings:
 
     @functools.cached_property
     def commands(self) -> dict[str, Command]:
-        """Pattern -> command that an action is to its motors."""
+        """Pattern -> command that an action represents for its motors."""
         return {
             pattern: command_of(actuator, self.action, pattern)
             for pattern, actuator in self.actuators.items()
@@ -85,7 +85,7 @@ class ActuatorBank:
         self.readout = Readout(model)
         self.motors = dict(self.readout.motors)
         """Actuator index in the model -> motor of the present episode."""
-        names, forced = matchable_names(model), settings.action == "force"
+        names, is_force_command = matchable_names(model), settings.action == "force"
         commands_by_index = {
             index: command
             for pattern, command in settings.commands.items()
@@ -99,14 +99,15 @@ class ActuatorBank:
         # A live view: MuJoCo counts its warnings in it.
         self._warnings = data.warning.number[_POSITION:]
         motor_commands = {
-            index: None if forced else commands_by_index.get(index) for index in self.motors
+            index: None if is_force_command else commands_by_index.get(index)
+            for index in self.motors
         }
         self._commands = ControlCommands(
             data, actions, motor_commands, settings.disturbances, step_duration
         )
         self.action_space = self._commands.action_space
         self.controls = self._commands.controls
-        """(element of `action_space`) -> the environment's own action, after disturbances."""
+        """(element of `action_space`) -> action of the original environment, after disturbances."""
         fixed = [
             commands_by_index[index].fixed if index in commands_by_index else {}
             for index in nominal
@@ -124,11 +125,11 @@ class ActuatorBank:
         )
         if not settings.allow_unstable:
             check_extremes(randomization, nominal, model)
-        self.draws = RandomizationState(
+        self.randomization_state = RandomizationState(
             randomization, [list(nominal.values())], functools.partial(apply_to_simulation, self)
         )
-        needs_key = settings.disturbances.random or randomization.random
-        self._random = needs_key or any(actuator.random for actuator in nominal.values())
+        draws_numbers = settings.disturbances.random or randomization.may_need_key
+        self._needs_key = draws_numbers or any(actuator.random for actuator in nominal.values())
         self.names = motor_names(model, self.motors)
         """Names of the motors, in the model's order."""
         families: list[Family] = list(map(type, self.motors.values()))
@@ -141,7 +142,7 @@ class ActuatorBank:
         self._parameters = list(map(_parameters, self.motors.values()))
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
-        """Exchange the motors for others of their families; a reset must follow."""
+        """Replace the motors by others of the same families; a reset must follow."""
         for index, actuator in zip(self.motors, actuators, strict=True):
             values = (actuator.arm_radius, *actuator.parameter_values)
             self.data.model.actuator_user[
@@ -161,7 +162,7 @@ class ActuatorBank:
         self.data.warning.number[:] = 0
         # The product is exactly an integer: numpy draws multiples of 2**-53, and the largest key
         # is 2**53.
-        key = generator.random() * MAX_KEY if self._random else 0.0
+        key = generator.random() * MAX_KEY if self._needs_key else 0.0
         for motor_index, (slot, motor) in enumerate(
             zip(self._slots, self.motors.values(), strict=True)
         ):
@@ -217,20 +218,18 @@ class ActuatorBank:
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return the state besides the simulation's: delayed commands, and drawn values."""
         delayed_commands = {name: memory.copy() for name, memory in self._commands.memory.items()}
-        return delayed_commands | self.draws.snapshot()
+        return delayed_commands | self.randomization_state.snapshot()
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Restore commands, motors and model; the simulation must be restored afterwards."""
-        self.draws.restore(snapshot)
+        self.randomization_state.restore(snapshot)
         for name, memory in self._commands.memory.items():
             memory[:] = snapshot[name]
 
 
 def motor_names(model: mujoco.MjModel, motors: Iterable[int]) -> tuple[str, ...]:
     """Return the motors' names: of the actuator or its target, or the index if not unique."""
-    actuator_names = [
-        unique_names[0] if unique_names else "" for unique_names in matchable_names(model)
-    ]
+    actuator_names = [names[0] if names else "" for names in matchable_names(model)]
     unique_names = [
         name if name and actuator_names.count(name) == 1 else str(index)
         for index, name in enumerate(actuator_names)

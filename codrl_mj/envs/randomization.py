@@ -55,11 +55,11 @@ class Randomization:
         allow_unstable: bool,
         model_name: str,
     ) -> None:
-        """Check the distributions against the fields that they are for.
+        """Check that motors and model have the fields, and allow the values, of the distributions.
 
         Args:
             distributions: path -> distribution, in the order of drawing.
-            model: the model without what its motors add to it.
+            model: the model without its motors' additions (`JointAdditions`).
             motors: actuator index -> motor.
             fixed: for each motor, fields that cannot be drawn -> reason.
             timestep: integration step [s] at which drawn motors must be stable.
@@ -71,7 +71,7 @@ class Randomization:
             timestep,
             allow_unstable,
         )
-        matched, simulated = (
+        matched, actuators = (
             _match_motors(distributions, model, motors, fixed, model_name),
             list(motors.values()),
         )
@@ -80,7 +80,7 @@ class Randomization:
                 path
                 for path, motor_indices in matched.items()
                 if any(
-                    _depends_on(quantity, simulated[motor_index], path)
+                    _depends_on(quantity, actuators[motor_index], path)
                     for motor_index in motor_indices
                 )
             ]
@@ -91,13 +91,13 @@ class Randomization:
         )
         model_only_paths = [path for path, motor_indices in matched.items() if not motor_indices]
         self.types = {
-            path: _type_of_field(type(simulated[motor_indices[0]]), path)
+            path: _type_of_field(type(actuators[motor_indices[0]]), path)
             if motor_indices
             else float
             for path, motor_indices in matched.items()
         }
         """Path -> type of the field: float, int or bool."""
-        self.families: list[Family] = list(map(type, simulated))
+        self.families: list[Family] = list(map(type, actuators))
         """Family of each motor of a simulation."""
         self.columns = [
             {
@@ -105,7 +105,7 @@ class Randomization:
                 for column, (path, motor_indices) in enumerate(matched.items())
                 if motor_index in motor_indices
             }
-            for motor_index in range(len(simulated))
+            for motor_index in range(len(actuators))
         ]
         """For each motor: column of the drawn values -> name of the field."""
         self.model_paths = (*model_only_paths, *paths_of_additions)
@@ -117,16 +117,16 @@ class Randomization:
             if self.model_paths
             else None
         )
-        """Effect of the drawn fields on the model; None if they have none."""
+        """Effect of the drawn fields on the model; None if only motors' parameters change."""
         self.changes_mounting = bool(paths_of_arms or paths_of_additions)
         """True if motors' arms, or what they add to the model, depend on drawn values."""
         self.draws_actuator = any(self.columns)
         """True if a motor's field is drawn, so that each draw must be checked for stability."""
         drawn_columns = zip(self.families, self.columns, strict=True)
-        self.random = any(
+        self.may_need_key = any(
             {*columns.values()} & {*family.RANDOM} for family, columns in drawn_columns
         )
-        """True if drawn values may make motors need an episode's key of random numbers."""
+        """True if drawn values may make motors need a random key."""
 
 
 class RandomizationState:
@@ -328,7 +328,7 @@ def check_extremes(
     held: bool = False,
     explicit: bool = False,
 ) -> None:
-    """Raise if draws could make a position or speed loop unstable, at combinations of their bounds.
+    """Raise if a combination of the distributions' bounds makes a position or speed loop unstable.
 
     Args:
         randomization: the distributions.
@@ -367,7 +367,7 @@ def check_extremes(
                 if model.actuator_plugin[index] < 0:
                     model.actuator_gear[model.actuator_outadr[index], 0] = 1.0 / actuator.arm_radius
         except ValueError:
-            # A reset draws such a set again.
+            # A reset rejects such values and draws again, so they are no error.
             continue
         write_fields(model, state.model_fields(np.zeros(1, dtype=int)))
         mujoco.mj_setConst(model, data)
@@ -383,21 +383,21 @@ def check_extremes(
             raise ValueError(f"randomize: {drawn_values}: {error}; or narrow the bounds") from None
 
 
-def apply_to_simulation(simulation: Any, draws: RandomizationState, rows: np.ndarray) -> None:
+def apply_to_simulation(simulation: Any, state: RandomizationState, rows: np.ndarray) -> None:
     """Write the drawn values into the only simulation of a `Physics` or an `ActuatorBank`."""
-    if draws.randomization.draws_actuator:
-        simulation.set_actuators(draws.motors())
-    if draws.randomization.variation is not None:
-        simulation.set_model(draws.model_fields(rows, shown=True))
+    if state.randomization.draws_actuator:
+        simulation.set_actuators(state.motors())
+    if state.randomization.variation is not None:
+        simulation.set_model(state.model_fields(rows, shown=True))
 
 
-def apply_to_batch(physics: Any, draws: RandomizationState, rows: np.ndarray) -> None:
+def apply_to_batch(physics: Any, state: RandomizationState, rows: np.ndarray) -> None:
     """Write the drawn values into a `MujocoBatchPhysics`, whose motors are of one family."""
-    parameters, arms, additions = draws.parameters(rows)
-    if draws.randomization.draws_actuator:
+    parameters, arms, additions = state.parameters(rows)
+    if state.randomization.draws_actuator:
         physics.set_parameters(rows, np.stack(parameters, axis=1), arms)
-    if draws.randomization.variation is not None:
-        physics.set_model(rows, draws.model_fields(rows, additions))
+    if state.randomization.variation is not None:
+        physics.set_model(rows, state.model_fields(rows, additions))
 
 
 def parameters_from_fields(family: Family, fields: np.ndarray) -> np.ndarray:
@@ -472,7 +472,7 @@ def _match_motors(
 def _check_known(
     field: str, motors: Sequence[ActuatorModel], model_fields: Sequence[str], model_name: str
 ) -> None:
-    """Raise if all these motors and the model have no field of this name."""
+    """Raise unless all of these motors, or the model, have a field of this name."""
     families: list[Family] = [
         DCMotorActuator if isinstance(actuator, Ideal) else type(actuator) for actuator in motors
     ]
@@ -491,7 +491,7 @@ def _check_known(
 
 
 def _check_model_factor(field: str, distribution: Distribution) -> None:
-    """Raise if a distribution has values that the model's field must not have."""
+    """Raise if a distribution has values out of the model field's bounds."""
     low, kind = min(distribution.extremes), field.split(".")[1]
     allowed_zero = kind in ("gravity", "damping")
     if (

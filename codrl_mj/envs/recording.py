@@ -1,4 +1,4 @@
-"""Recording of every integration step in third-party environments: their `recorder`."""
+"""Recorder of every integration step of a third-party environment."""
 
 from typing import Any
 

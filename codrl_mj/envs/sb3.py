@@ -90,7 +90,7 @@ class ActuatedVecEnv(VecEnv):
 
     @property
     def signals(self) -> Signals | None:
-        """Actuators' signals of the last step, shape (N,) or (N, motors); None before it."""
+        """Actuators' signals of the last step, shape (N,) or (N, motors); None before the first."""
         return self.env.signals
 
     @property
@@ -132,7 +132,7 @@ class ActuatedVecEnv(VecEnv):
     def conclude(
         self, observation: np.ndarray, total: float, length: int, truncated: bool, signals: Signals
     ) -> tuple[np.ndarray, list[dict[str, Any]]]:
-        """End the episode of the only environment as it was run by compiled code; reset it.
+        """Record an episode that compiled code ran in the only environment, and reset it.
 
         Args:
             observation: its last observation, shape (k,).
@@ -202,7 +202,7 @@ class ActuatedVecEnv(VecEnv):
         return self.env.image()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute for each of the environments; a vector's is shared by all."""
+        """Return an attribute for each environment; all share an attribute of the vector."""
         shared = isinstance(self.env, SerialVectorEnv) and hasattr(self.env, attr_name)
         values = (
             [getattr(self.env, attr_name)] * self.num_envs
@@ -212,7 +212,7 @@ class ActuatedVecEnv(VecEnv):
         return [values[index] for index in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the vector environment, or that of every single environment."""
+        """Set an attribute of the vector environment, or of each single environment."""
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError(
                 f"set_attr({attr_name!r}): the environments share it; it can only be set for all of"
@@ -232,7 +232,7 @@ class ActuatedVecEnv(VecEnv):
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return True for `Monitor`, whose work this class does; there are no other wrappers."""
+        """Return True for `Monitor`, which this class replaces; there are no other wrappers."""
         from stable_baselines3.common.monitor import Monitor
 
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]

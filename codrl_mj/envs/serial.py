@@ -1,4 +1,4 @@
-"""Single environments that are stepped one by one: a `VectorEnv` for all that cannot be batched."""
+"""A `VectorEnv` that steps single environments one by one, if they cannot be batched."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -45,8 +45,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
                 must be picklable if processes are used.
             actuator: as for `ActuatedEnv`; or a sequence with one actuator for each environment.
             max_episode_steps: time limit of each environment [steps]; None for none.
-            autoreset_mode: time of the reset of an environment whose episode ended, as for
-                `ActuatedVectorEnv`.
+            autoreset_mode: reset of an environment after its episode, as for `ActuatedVectorEnv`.
             num_threads: 0 or 1; there is only one thread.
             **arguments: the other arguments of `ActuatedEnv`, such as `physics`; or those of the
                 function.
@@ -179,7 +178,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
             )
             for row, env in enumerate(self.envs)
         ]
-        # The signals belong to a step that is not in the restored episode's past.
+        # The last step's signals are not part of a snapshot.
         self.signals = None
         self._autoreset_envs[:] = snapshot.get("ended", False)
         if first_observations[0] is not None:

@@ -25,21 +25,21 @@ from codrl_mj.tasks import Task, find_task
 from codrl_mj.user_code import look_up
 
 NEEDS_KEY, FIRST_OPTION = 0, 1
-"""Indices in `ResolvedEnv.options`: if an episode needs a key, and the task's first option."""
+"""Indices in `ResolvedEnv.options` of the flag `needs_key` and of the task's first option."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ResolvedEnv:
-    """Environment of a task with its resolved configuration; `build` makes it.
+    """Resolved configuration of a task's environment; `build` creates it.
 
-    Derived quantities are computed from the fields on first use. `dataclasses.replace` with another
-    task, for example with written attributes, therefore updates all of them.
+    Derived quantities are computed from the fields on first use. `dataclasses.replace` with a
+    changed task, for example after an attribute was written, therefore updates all of them.
     """
 
     config: EnvConfig
     """Configuration that the user gave."""
     task: Task
-    """Task with its present attributes."""
+    """The task, with the current values of its attributes."""
     inner_steps: int
     """Integration steps per environment step."""
 
@@ -56,7 +56,7 @@ class ResolvedEnv:
         return setup
 
     def _check(self) -> None:
-        """Raise if fields contradict each other, the step, or the mechanics that motors move."""
+        """Raise if fields contradict each other, or if motors are unstable with their joints."""
         simulation, allow_unstable = self.simulation, self.config.allow_unstable
         check_delay(self.config.disturbances, self.task.step_duration, self.config.time_limit)
         # The property raises if there is nothing to observe.
@@ -90,14 +90,14 @@ class ResolvedEnv:
     def simulation(self) -> SimulationConfig:
         """Settings of the simulation."""
         integrator, commands = self.task.integrator(self.config.integrator), self.commands
-        forces_and_disturbances = (
+        further_settings = (
             commands.max_forces,
             self.config.disturbances,
             self.config.joint,
-            commands.holds,
+            commands.force_per_position,
         )
         return SimulationConfig(
-            self.task, commands.simulated, self.inner_steps, integrator, *forces_and_disturbances
+            self.task, commands.simulated, self.inner_steps, integrator, *further_settings
         )
 
     @functools.cached_property
@@ -144,21 +144,22 @@ class ResolvedEnv:
 
     @functools.cached_property
     def options(self) -> np.ndarray:
-        """Values that compiled code reads: if episodes need keys, and the task's options."""
-        return np.array([self.random, *self.config.options], dtype=np.float64)
+        """Vector that compiled code reads: 1 or 0 for `needs_key`, then the task's options."""
+        return np.array([self.needs_key, *self.config.options], dtype=np.float64)
 
     @functools.cached_property
-    def random(self) -> bool:
-        """True if an episode's disturbances or sensors need a key of random numbers."""
-        needs_key = self.config.disturbances.random or self.randomization.random
-        return needs_key or any(actuator.random for actuator in self.simulation.actuators)
+    def needs_key(self) -> bool:
+        """True if an episode's disturbances or sensors need a random key."""
+        draws_numbers = self.config.disturbances.random or self.randomization.may_need_key
+        return draws_numbers or any(actuator.random for actuator in self.simulation.actuators)
 
     def keys(self, random: Callable[[int], np.ndarray]) -> np.ndarray:
-        """Return keys for the random numbers of m episodes, shape (m,); a single 0 if not needed.
+        """Return the random keys of m episodes, shape (m,); a single 0 if none is needed.
 
-        Disturbances and sensors use the keys. `random` is (count) -> draws in [0, 1), (m, count).
+        A key selects the counter-based random numbers of disturbances and sensors. `random` is a
+        function (count) -> draws in [0, 1), shape (m, count).
         """
-        if not self.random:
+        if not self.needs_key:
             return np.zeros(1)
         # The product is exactly an integer: draws are multiples of 2**-53, the factor is 2**53.
         return random(1)[:, 0] * MAX_KEY
@@ -167,7 +168,7 @@ class ResolvedEnv:
 
     @functools.cached_property
     def sensors(self) -> tuple[str, ...]:
-        """Names of the sensor values that observations end with; empty if they are not observed."""
+        """Names of the sensors at the end of observations; empty without `observe_actuator`."""
         names = self.task.motors if len(self.task.motors) > 1 else ("",)
         return (
             sensor_names(dict.fromkeys(names, self.simulation.family))
@@ -211,7 +212,7 @@ class ResolvedEnv:
 
     @functools.cached_property
     def _read_info(self) -> Callable[[Any], Signals]:
-        """Reader of the trace's columns by their names."""
+        """Function that turns columns of the trace into a mapping of names to columns."""
         return make_info_reader(trace_names(self.simulation.family)[:-1])
 
     def __getstate__(self) -> dict[str, Any]:
@@ -219,7 +220,7 @@ class ResolvedEnv:
         return {name: value for name, value in self.__dict__.items() if name != "_read_info"}
 
     def signals(self, columns: Sequence[Any] | np.ndarray, desired: Any) -> Signals:
-        """Name a trace's columns, numbers or arrays, and add the `desired` force [N or N*m].
+        """Return a trace's columns by name, with the `desired` force [N or N*m].
 
         If the actuator does not follow a force command, `desired_force` is the delivered force.
         """
@@ -236,7 +237,7 @@ def unwrap_single(values: Sequence[Any]) -> Any:
 
 
 def is_per_environment(actuator: Any, task: str) -> bool:
-    """Return True if `actuator` lists one for each environment, and not one for each motor."""
+    """Return True if `actuator` is a list with one actuator per environment, not per motor."""
     is_listed = isinstance(actuator, Sequence) and not isinstance(actuator, str)
     return is_listed and (
         len(find_task(task).motors) == 1
@@ -272,8 +273,8 @@ def set_up_many(
             raise ValueError(f"actuator[{index}]: {error}") from None
         if isinstance(actuators[-1][0], Ideal):
             raise ValueError(
-                f"actuator[{index}] = {env_actuator!r}: must be an Actuator; the ideal one cannot"
-                " be combined with others"
+                f"actuator[{index}] = {env_actuator!r}: must not be ideal: environments with and"
+                " without motors cannot be combined"
             )
-    check_same_family([family_members[0] for family_members in setups])
+    check_same_family([motor_actuators[0] for motor_actuators in setups])
     return setups[actuators[0]], actuators

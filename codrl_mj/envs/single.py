@@ -25,7 +25,8 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     Observation, action, reward, initial states and termination are those of Gymnasium's task. The
     difference is the force: the action selects the desired force, and the actuator delivers the
-    actual force. With `actuator="ideal"` both are equal, and the environment replaces Gymnasium's.
+    actual force. With `actuator="ideal"` both are equal, and the environment is a
+    drop-in replacement for Gymnasium's.
 
     Every step's `info` has `desired_force`, `actual_force` [N or N*m], the signals of the
     actuator's family and `saturated` (bool), each at the end of the step. A current loop has the
@@ -61,8 +62,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             physics: `mujoco`, `analytic` (Gymnasium's equations, or a closed form), or a registered
                 name.
             render_mode: None; `rgb_array`: `render` returns images; `human`: pygame shows every
-                step in a window. Other modes, of which `gymnasium.make` warns, are refused at
-                rendering.
+                step in a window. `render` refuses other modes, about which `gymnasium.make` warns.
             width: width of rendered images [px].
             height: height of rendered images [px].
             camera: a camera of the model: `fixed` or `close`.
@@ -81,7 +81,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self.setup = ResolvedEnv.build(config)
         self.physics = self.setup.simulate()
         apply_values = functools.partial(apply_to_simulation, self.physics)
-        self._draws = RandomizationState(
+        self._randomization_state = RandomizationState(
             self.setup.randomization, [self.setup.simulation.actuators], apply_values
         )
         self.render_mode = render_mode
@@ -89,7 +89,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         self._renderer: OffscreenRenderer | None = None
         self._window: Window | None = None
-        self._shown: Any = None
+        self._fallback_scene: Any = None
         if render_mode is not None:
             check_view(self._scene().scene[0], width, height, camera)
         self.action_space = self.setup.commands.action_space
@@ -113,12 +113,12 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     @property
     def actuator(self) -> Any:
         """Actuator of the present episode; for several motors a tuple."""
-        return unwrap_single(self._draws.motors(0, self.setup.config.actuators))
+        return unwrap_single(self._randomization_state.motors(0, self.setup.config.actuators))
 
     @property
     def motors(self) -> dict[int, Any]:
         """Motor index of the task -> actuator of the present episode."""
-        return dict(enumerate(self._draws.motors(0, self.setup.config.actuators)))
+        return dict(enumerate(self._randomization_state.motors(0, self.setup.config.actuators)))
 
     @property
     def model(self) -> Any:
@@ -132,7 +132,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     @property
     def state(self) -> np.ndarray:
-        """Mechanical state, shape (n,), float64, in Gymnasium's order; writing keeps the motor."""
+        """Mechanical state, shape (n,), float64, as in Gymnasium; setting it keeps the motor."""
         return self.physics.state.copy()
 
     @state.setter
@@ -141,7 +141,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     @property
     def recorder(self) -> "ActuatedEnv":
-        """Reader of the environment's state between its steps: the environment itself."""
+        """Object with the signals of each integration step: the environment itself."""
         return self
 
     @property
@@ -196,7 +196,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         super().reset(seed=seed)
         generator, setup = self.np_random, self.setup
         initial = setup.task.draw_initial_state(generator, options)
-        self._draws.draw_single(generator)
+        self._randomization_state.draw_single(generator)
         self.physics.reset(
             initial, float(setup.keys(lambda count: generator.random((1, count)))[0])
         )
@@ -222,7 +222,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         if self._compiled is None:
             if self.physics.stepping is None:
                 return self._step_in_python(self.setup.commands.force(action))
-            self._compiled = self._parts()
+            self._compiled = self._bind_step()
         force_of, step, pointers, observation, read_columns, name_signals = self._compiled
         force = force_of(action)
         reward, terminated, is_finite = step(force, pointers)
@@ -232,8 +232,8 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             self.render()
         return observation.copy(), reward, terminated, False, name_signals(read_columns(), force)
 
-    def _parts(self) -> tuple[Any, ...]:
-        """Return what `step` uses: commands, compiled step, its arguments, and signal readers."""
+    def _bind_step(self) -> tuple[Any, ...]:
+        """Return the compiled step, its arguments, and the functions that `step` calls."""
         setup, row = self.setup, self.physics.trace[-1]
         columns = row[0].tolist if len(row) == 1 else row.T.copy
         compiled = (
@@ -257,7 +257,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     @property
     def randomization(self) -> dict[str, Any]:
         """Drawn values of the present episode, as in the reset's info; NaN before a reset."""
-        return self._draws.report()
+        return self._randomization_state.report()
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays: simulation, motor, generator, drawn values.
@@ -271,7 +271,9 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         }
         if self.physics.memory.size:
             state["disturbances"] = self.physics.memory.copy()
-        return state | {name: np.array(rows[0]) for name, rows in self._draws.snapshot().items()}
+        return state | {
+            name: np.array(rows[0]) for name, rows in self._randomization_state.snapshot().items()
+        }
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Continue from a snapshot, bit for bit, in an environment made with the same arguments.
@@ -281,13 +283,13 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
                 shapes; nothing was changed.
         """
         check_snapshot(snapshot, self.snapshot(), "task")
-        self._draws.restore(snapshot)
+        self._randomization_state.restore(snapshot)
         self.physics.restore(snapshot["physics"])
         self.physics.memory[:] = snapshot.get("disturbances", 0.0)
         self.np_random = generator_from_words(snapshot["generator"])
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """Render the state as an image (height, width, 3), uint8; None in a window or without mode.
+        """Render the state as an image (height, width, 3), uint8; None unless mode is `rgb_array`.
 
         Raises:
             ValueError: unknown render mode.
@@ -320,24 +322,24 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         """Return the physics to render; the task's ideal model if this physics has none."""
         if self.physics.scene is not None:
             return self.physics
-        if self._shown is None:
-            self._shown = MujocoPhysics(
+        if self._fallback_scene is None:
+            self._fallback_scene = MujocoPhysics(
                 SimulationConfig(self.task, [IDEAL] * len(self.task.motors))
             )
-        return self._shown
+        return self._fallback_scene
 
     def close(self) -> None:
         """Free the OpenGL context, and close the window."""
         for resource in (self._renderer, self._window):
             if resource is not None:
                 resource.close()
-        self._renderer = self._window = self._shown = None
+        self._renderer = self._window = self._fallback_scene = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the renderer, the window and the compiled step; a copy makes new ones."""
         return self.__dict__ | {
             "_renderer": None,
             "_window": None,
-            "_shown": None,
+            "_fallback_scene": None,
             "_compiled": None,
         }

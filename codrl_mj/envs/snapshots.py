@@ -16,7 +16,7 @@ _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 def time_limits(env: "gymnasium.Env[Any, Any]") -> list[Any]:
-    """Return the time-limit wrappers, from the outermost to the first with its own snapshots."""
+    """Return the time-limit wrappers, outermost first, up to a wrapper with its own snapshots."""
     limits = []
     while isinstance(env, gymnasium.Wrapper) and not hasattr(type(env), "snapshot"):
         # The attribute identifies Gymnasium's TimeLimit and the class that rl-zoo3 replaces it by.
@@ -44,7 +44,7 @@ def encode_name(name: str) -> np.ndarray:
 
 
 def generator_from_words(words: np.ndarray) -> np.random.Generator:
-    """Create a generator with the state that `codrl_mj.physics.streams.generator_words` returned."""
+    """Create a generator with the state that `generator_words` of `physics.streams` returned."""
     generator, _ = seeding.np_random(0)
     set_generator_words(generator, words)
     return generator
@@ -55,7 +55,7 @@ def check_snapshot(
 ) -> None:
     """Raise if a snapshot's entries, shapes or types differ from those of an expected snapshot.
 
-    The entry `name`, if it is not empty, must also have the same value, which `encode_name` wrote.
+    If `name` is not empty, the entry of that name, which `encode_name` wrote, must be equal.
     """
     for entry in [*expected, *(key for key in snapshot if key not in expected)]:
         present, required = (
@@ -91,8 +91,9 @@ _COMPUTED = tuple(
 def state_of(data: mujoco.MjData) -> dict[str, np.ndarray]:
     """Return MuJoCo's state vector (`mjSTATE_INTEGRATION`) and the arrays computed from it.
 
-    A step leaves poses and forces at the beginning of its last integration step, and environments
-    compute observations and rewards from them: the state alone would not continue bit for bit.
+    After a step, poses and forces are those at the beginning of its last integration step.
+    Environments compute observations and rewards from them, so the state alone could not continue
+    bit for bit.
     """
     state = np.empty(mujoco.mj_stateSize(data.model, _STATE))
     mujoco.mj_getState(data.model, data, state, _STATE)
@@ -103,7 +104,7 @@ def state_of(data: mujoco.MjData) -> dict[str, np.ndarray]:
 
 
 def set_state_of(data: mujoco.MjData, state: np.ndarray, computed: np.ndarray) -> None:
-    """Restore what `state_of` returned, in a simulation of the same model."""
+    """Restore the arrays of `state_of` in a simulation of the same model."""
     mujoco.mj_setState(data.model, data, state, _STATE)
     start = 0
     for name in _COMPUTED:

@@ -1,8 +1,8 @@
-"""Env sources: what environments are made of, before they have motors.
+"""Env sources: factories of environments to which motors are added.
 
-A source is a task, a Gymnasium id, or a custom instance of a subclass of `EnvSource`, which is
-found as `module:NAME`. An `EnvConfig` names its source, and calls it for everything that differs
-between kinds of environments; no file of the package needs to know a custom source.
+A source represents a task or a Gymnasium id, or is a custom instance of an `EnvSource` subclass
+with the name `module:NAME`. An `EnvConfig` names its source, and calls it for everything that
+differs between kinds of environments. A custom source therefore needs no change in this package.
 """
 
 import abc
@@ -45,10 +45,10 @@ _UNITS = (
 
 
 class EnvSource(abc.ABC):
-    """Source of environments; a custom one has a name, `make`, and overrides defaults as needed.
+    """Source of environments; a subclass defines `name` and `make`, and may override the rest.
 
-    Its environments are Gymnasium's with readable motors, such as `codrl_mj.make` makes of any
-    function that returns an environment with MuJoCo's `model` and `data`.
+    `make` returns a Gymnasium environment whose motors can be read. `codrl_mj.make` creates one
+    from any function that returns an environment with MuJoCo's `model` and `data`.
     """
 
     name: str
@@ -60,13 +60,13 @@ class EnvSource(abc.ABC):
     default_actuator: str = "ideal"
     """Actuator of its motors if the configuration names none."""
     paper: tuple[Any, ...] = ()
-    """Actuators that `paper`, `weak` and so on are variations of; empty if there are none."""
+    """Actuators from which the named ones (`paper`, `weak`, ...) are derived; empty if none."""
     preset: str | None = None
-    """Task whose agents' settings to use; None for settings for any environment."""
+    """Task whose tuned agent settings are the defaults; None for general settings."""
     goal_hold: float = 0.0
-    """Time at the goal that a successful episode ends with [s]."""
+    """Minimum time at the goal at the end of a successful episode [s]."""
     timed: bool = False
-    """True if the goal is reached at a time; False if it must be kept all the time."""
+    """True if the time to reach the goal is reported; False if success is not to terminate."""
     env_id: str = ""
     """Gymnasium id, if `gymnasium.make` accepts the fields of an `EnvConfig` for it."""
     option_names: tuple[str, ...] = ()
@@ -85,7 +85,7 @@ class EnvSource(abc.ABC):
         """
 
     def vector(self, config: Any, num_envs: int, **arguments: Any) -> Any:
-        """Make a Gymnasium vector environment in `SAME_STEP` mode; by default not as a batch.
+        """Make a Gymnasium vector environment in `SAME_STEP` mode; by default stepped one by one.
 
         Args:
             config: their `EnvConfig`.
@@ -134,7 +134,7 @@ class EnvSource(abc.ABC):
         try:
             json_options = json.loads(json.dumps(dict(options or {})))
             if reserved_names := {"render_mode", *self.fields} & json_options.keys():
-                raise ValueError(f"{reserved_names.pop()!r} is no argument of the environment's")
+                raise ValueError(f"{reserved_names.pop()!r} is not an argument of the environment")
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"options = {options!r}: must be a mapping that JSON can hold ({error}); register"
@@ -156,7 +156,7 @@ class EnvSource(abc.ABC):
         return [("options", tuple[str, ...], description, values)]
 
     def options_of(self, flags: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the options that the values of their flags describe.
+        """Parse the options from the values of their flags.
 
         Raises:
             ValueError: an item is not NAME=VALUE.
@@ -185,7 +185,7 @@ class EnvSource(abc.ABC):
         )
 
     def actuators_by_name(self, actuators: Any) -> dict[str, ActuatorModel]:
-        """Return pattern -> actuator, for what `actuators` returned."""
+        """Return pattern -> actuator from the result of `actuators`."""
         return dict(actuators)
 
     def overlaid(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
@@ -224,13 +224,13 @@ class EnvSource(abc.ABC):
         )
 
     def as_with_motors(self, config: Any) -> Any:
-        """Return a configuration whose trace shows the forces that motors would need."""
+        """Return a configuration with the time resolution that motors would need."""
         return config
 
     # -- properties that are read from an environment -----------------------------------------
 
     def action_space(self, config: Any) -> "spaces.Space[Any]":
-        """Return the action space without motors; the space with other commands has its kind."""
+        """Return the action space without motors; other commands change its bounds or size."""
         return _original_action_space(self, json.dumps(self.changed(config.options)))
 
     def default_agent(self, config: Any) -> str:
@@ -244,14 +244,14 @@ class EnvSource(abc.ABC):
         height: int,  # noqa: ARG002
         camera: str | None,
     ) -> dict[str, Any] | None:
-        """Return arguments of `make` for images of a size [px]; None to render recorded states.
+        """Return arguments for `make` that set the image size [px]; None to render recorded states.
 
         Raises:
             ValueError: it has no such camera, or no choice of cameras.
         """
         if camera is not None:
             raise ValueError(
-                f"camera = {camera!r}: {self.name} draws itself, by its own camera: leave it out"
+                f"camera = {camera!r}: {self.name} always renders with its own camera: leave it out"
             )
         return {"render_mode": "rgb_array"}
 
@@ -261,7 +261,7 @@ class EnvSource(abc.ABC):
             return env.unwrapped.model, None, None
 
     def state_names(self, config: Any) -> tuple[str, ...]:
-        """Return names with units of an episode's states: positions and speeds of the joints."""
+        """Return names and units of the recorded states: positions and speeds of the joints."""
         model = self.scene(config)[0]
         positions: list[str] = []
         speeds: list[str] = []
@@ -304,7 +304,7 @@ class EnvSource(abc.ABC):
         return observations, describe_box(names, action_space)
 
     def at_goal(self, episode: Any) -> np.ndarray | None:
-        """Return at which of the T+1 states an episode was at the goal; None if unknown."""
+        """Return a bool array (T+1,), True for states at the goal; None if unknown."""
         return None if episode.succeeded is None else np.full(len(episode.state), episode.succeeded)
 
 
@@ -344,7 +344,7 @@ def _original_action_space(source: EnvSource, options: str) -> "spaces.Space[Any
 
 
 def actuators_by_pattern(actuator: Any, default: str = "ideal") -> Mapping[str, Any]:
-    """Return pattern -> actuator, from a user's value for the actuators of an environment."""
+    """Return pattern -> actuator, from a user's value of `actuator`."""
     if actuator in ({}, []) or isinstance(actuator, list | tuple):
         raise ValueError(
             f"actuator = {actuator!r}: must be one for all motors, or a mapping of patterns to"
@@ -354,7 +354,7 @@ def actuators_by_pattern(actuator: Any, default: str = "ideal") -> Mapping[str, 
 
 
 def pattern_mapping(actuator: Any) -> Mapping[str, Any] | None:
-    """Return a user's value for actuators if it maps patterns to them; otherwise None."""
+    """Return a user's `actuator` if it is a mapping of patterns to actuators; otherwise None."""
     if not isinstance(actuator, Mapping) or {"family", "name"} & actuator.keys():
         return None
     for value in actuator.values():
@@ -376,9 +376,9 @@ def pattern_mapping(actuator: Any) -> Mapping[str, Any] | None:
 
 
 def is_source_name(name: str) -> bool:
-    """Return True if a text names a source; any `module:NAME` does.
+    """Return True if a text may name a source, as every `module:NAME` may.
 
-    A name that looks like an environment's id, `runs/swing-v2`, but is a folder, does not.
+    The path of a folder does not, even if it looks like a Gymnasium id (`runs/swing-v2`).
     """
     if name in TASKS or re.fullmatch(r"[\w.]+:[\w.]+", name) is not None:
         return True
@@ -396,7 +396,7 @@ def find_source(name: Any) -> EnvSource:
                 return source_module.find(name)
         if ":" in name:
             return source_of(load_object(name))
-    # The first module refuses the name, and lists the tasks that exist.
+    # The task module's `find` raises an error that lists the known tasks.
     return importlib.import_module(_SOURCE_MODULES[0]).find(name)
 
 

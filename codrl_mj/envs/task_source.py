@@ -45,13 +45,13 @@ class TaskEnvSource(EnvSource):
         self.option_names, self.env_id = task.options._fields, task.env_id
 
     def make(self, config: Any, **view: Any) -> Any:
-        """Make an environment by Gymnasium; `view` as for `codrl_mj.envs.ActuatedEnv`."""
+        """Make an environment with `gymnasium.make`; `view` as for `codrl_mj.envs.ActuatedEnv`."""
         return gymnasium.make(
             self.env_id, disable_env_checker=True, **config.as_arguments(), **view
         )
 
     def vector(self, config: Any, num_envs: int, **arguments: Any) -> Any:
-        """Make a vector environment: a batch on MuJoCo, otherwise single environments in turn."""
+        """Make a vector environment: a batch on MuJoCo, otherwise stepped one by one."""
         from codrl_mj.envs.serial import SerialVectorEnv
         from codrl_mj.envs.vector import ActuatedVectorEnv
 
@@ -120,7 +120,7 @@ class TaskEnvSource(EnvSource):
         }
 
     def option_flags(self, config: Any) -> list[tuple[str, Any, str, Any]]:
-        """Return the flags of all tasks' options, so that those of others are refused by name."""
+        """Return the flags of all tasks' options, so that messages can name another task's flag."""
         option_types: dict[str, Any] = {name: task.options for name, task in TASKS.items()}
         changed_options = self.changed(config.options)
         return [
@@ -148,7 +148,7 @@ class TaskEnvSource(EnvSource):
         return actuators[0] if len(actuators) == 1 else actuators
 
     def _by_pattern(self, patterns: Mapping[str, Any]) -> dict[str, Any]:
-        """Return motor -> actuator, from patterns of motor names, as for a model with several."""
+        """Return motor -> actuator, from a mapping of patterns of motor names to actuators."""
         # The import is local because it imports numba, which takes long.
         from codrl_mj.engine.specs import match_pattern, split_pattern
 
@@ -235,7 +235,7 @@ class TaskEnvSource(EnvSource):
         return self.task.state_names
 
     def interface(self, config: Any) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        """Describe observation and action by the names and units of task, sensors and commands."""
+        """Describe observation and action, with names and units of task, sensors and commands."""
         from codrl_mj.envs.commands import command_of
         from codrl_mj.envs.setup import ResolvedEnv
 
@@ -272,14 +272,14 @@ class TaskEnvSource(EnvSource):
         ]
 
     def at_goal(self, episode: Any) -> np.ndarray | None:
-        """Evaluate the task's goal; for a task without one, success is not to terminate."""
+        """Return True for states at the goal; without a goal, for all unless it terminated."""
         if self.task.goal is None:
             return np.full(len(episode.state), not episode.terminated)
         return np.asarray(self.task.goal(episode.state.T), dtype=bool)
 
 
 def claims(name: str) -> bool:
-    """Return True if the name is that of a task, as on the command line or in Gymnasium."""
+    """Return True if this is a task's name or Gymnasium id."""
     return name in TASKS or any(name == task.env_id for task in TASKS.values())
 
 

@@ -1,4 +1,4 @@
-"""Thousands of environments that compiled code steps together: Gymnasium's `VectorEnv`."""
+"""A Gymnasium `VectorEnv` of thousands of environments that compiled code steps together."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -66,15 +66,15 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             actuator: as for `ActuatedEnv`; or a sequence of N actuators (tuples of them for several
                 motors), one for each environment: all of one family, and not ideal.
             max_episode_steps: time limit of each environment [steps]; None for none.
-            autoreset_mode: time of the reset of an environment whose episode ended: in the
-                `NEXT_STEP`, in the `SAME_STEP`, or by the caller (`DISABLED`), with
-                `reset(options={"reset_mask": ...})`.
+            autoreset_mode: reset of an environment after its episode: in the next step
+                (`NEXT_STEP`), in the same step (`SAME_STEP`), or by the caller (`DISABLED`), who
+                calls `reset(options={"reset_mask": ...})`.
             num_threads: threads of the engine; 0 uses every CPU. Results do not depend on it.
             physics: `mujoco`; the analytic physics steps one Gymnasium environment at a time and
                 cannot be batched.
             render_mode: None; or `rgb_array`: `render` returns an image of every environment,
-                `image` that of one; or `rgb_array_list`, the same, as Gymnasium's vector wrappers
-                expect.
+                `image` that of one; or `rgb_array_list`, the same under the name that Gymnasium's
+                vector wrappers expect.
             width: width of rendered images [px].
             height: height of rendered images [px].
             camera: a camera of the model.
@@ -121,7 +121,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self.arm_radii = np.array([motor.arm_radius for motor in self.setup.config.actuators])
         """Arms of the motors of an environment [m], shape (motors,)."""
         self._streams = Streams(self.num_envs)
-        self._draws = RandomizationState(
+        self._randomization_state = RandomizationState(
             self.setup.randomization, actuators, functools.partial(apply_to_batch, self.physics)
         )
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
@@ -145,7 +145,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
 
     @property
     def state(self) -> Array:
-        """Mechanical states, shape (N, n), float64, as in Gymnasium; writing keeps the motors."""
+        """Mechanical states, shape (N, n), float64, as in Gymnasium; setting keeps the motors."""
         return self.physics.state
 
     @state.setter
@@ -207,7 +207,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             write(name, env_value, self.setup, model)
             for field, rows in (fields | visual_fields).items():
                 rows[row] = field_of(model, field)
-        # Writing the fields resets the simulations' derived quantities; the states are restored.
+        # A reset or restore must follow `set_model`; restoring keeps the states.
         snapshot = self.physics.snapshot()
         self.physics.set_model(np.arange(self.num_envs), fields)
         self.physics.restore(snapshot)
@@ -216,7 +216,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
     @property
     def randomization(self) -> dict[str, Array]:
         """Drawn values of the present episodes, path -> array (N,), and the number `rejected`."""
-        return self._draws.drawn_values()
+        return self._randomization_state.drawn_values()
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
@@ -278,14 +278,14 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         low, high = self.setup.task.bounds(options) if options else self.setup.initial_bounds
         draws = low + (high - low) * self._streams.random(rows, len(low))
         states = self.setup.task.initial_states(draws)
-        self._draws.draw(self._streams.random, rows)
+        self._randomization_state.draw(self._streams.random, rows)
         self.physics.reset(
             rows, states, self.setup.keys(lambda count: self._streams.random(rows, count))
         )
         self.physics.observe(self._compiled()[0].observe_rows, rows, self._observations)
         self._elapsed[rows] = 0
         self._ended[rows] = False
-        return self._draws.infos(rows)
+        return self._randomization_state.infos(rows)
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Advance every environment by one step.
@@ -322,7 +322,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         kernels, steps = self._compiled()
         steps.forces[:], steps.stepping[:] = forces, stepping
         steps.limit[0] = np.inf if self.max_episode_steps is None else self.max_episode_steps
-        broken = self.physics.step(kernels.step_rows, steps)
+        has_diverged = self.physics.step(kernels.step_rows, steps)
         rewards, terminated, truncated = (
             steps.rewards.copy(),
             steps.terminated.copy(),
@@ -330,8 +330,9 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         )
         columns = steps.signals.reshape(-1, *forces.shape).copy()
         self.signals = signals = self.setup.signals([forces, *columns], forces)
-        if broken:
-            # The exception leaves this method; episodes that ended must still be reset later.
+        if has_diverged:
+            # `check_finite` raises. Record which episodes ended first, because they must still be
+            # reset.
             self._ended |= terminated | truncated
             self.physics.check_finite(self.physics.state, stepping)
         infos = _vector_infos(signals, stepping)
@@ -397,7 +398,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         }
         if self.physics.memory.size:
             state["disturbances"] = self.physics.memory.copy()
-        return state | self._draws.snapshot()
+        return state | self._randomization_state.snapshot()
 
     def restore(self, snapshot: Mapping[str, Array]) -> None:
         """Continue from a snapshot, bit for bit.
@@ -406,12 +407,12 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             ValueError: the snapshot is of another number of environments, or of another task.
         """
         check_snapshot(snapshot, self.snapshot())
-        self._draws.restore(snapshot)
+        self._randomization_state.restore(snapshot)
         self.physics.restore(snapshot["physics"])
         self._streams.set_state(snapshot["streams"])
         self._elapsed[:], self._ended[:] = snapshot["elapsed"], snapshot["ended"]
         self._observations[:] = snapshot["observations"]
-        # The signals belong to a step that is not in the restored episode's past.
+        # The last step's signals are not part of a snapshot.
         self.signals = None
         if self.physics.memory.size:
             self.physics.memory[:] = snapshot["disturbances"]
@@ -434,7 +435,9 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             return None
         if self._renderer is None:
             self._renderer = OffscreenRenderer(self.physics.model, **self._view)  # type: ignore[arg-type]
-        write_fields(self.physics.model, self._draws.model_fields(np.array([row]), shown=True))
+        write_fields(
+            self.physics.model, self._randomization_state.model_fields(np.array([row]), shown=True)
+        )
         write_fields(self.physics.model, self.model_fields, row)
         self.physics.show(row)
         return self._renderer.render(self.physics.data)

@@ -60,7 +60,7 @@ class MotorsAddedEnvironment(dm_env.Environment):
     def reset(self) -> dm_env.TimeStep:
         """Start an episode, with the motors at rest; composer environments rebuild their model."""
         if self._settings.randomize is not None:
-            self._bank.draws.draw_single(self._generator)
+            self._bank.randomization_state.draw_single(self._generator)
         with self._patcher.patch_model_loading():
             timestep = self._environment.reset()
         self._ended = False
@@ -110,7 +110,7 @@ class MotorsAddedEnvironment(dm_env.Environment):
     @property
     def randomization(self) -> dict[str, Any]:
         """Drawn values of the present episode; empty if nothing is randomized."""
-        return self._bank.draws.report()
+        return self._bank.randomization_state.report()
 
     def signals(self) -> dict[str, Any]:
         """Return the motors' signals after the last step, as in `info` of `codrl_mj.make`.

@@ -249,7 +249,7 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             # The spawn key makes the motors' numbers independent of the environment's own.
             seed_sequence = np.random.SeedSequence(seed, spawn_key=(1,))
             self._generator = np.random.Generator(np.random.PCG64(seed_sequence))
-        self._bank.draws.draw_single(self._generator)
+        self._bank.randomization_state.draw_single(self._generator)
         observation, info = self.env.reset(seed=seed, options=options)
         self._was_reset = True
         self._bank.begin(self._generator)
@@ -291,7 +291,7 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
     @property
     def randomization(self) -> dict[str, Any]:
         """Drawn values of the present episode, as in the reset's info; empty without draws."""
-        return self._bank.draws.report()
+        return self._bank.randomization_state.report()
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays: simulation, motors, generators, draws, time limit.

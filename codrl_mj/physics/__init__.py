@@ -23,12 +23,11 @@ PHYSICS.update(mujoco=MujocoPhysics, analytic=AnalyticPhysics)
 
 
 def register_physics(name: str, make: Callable[[SimulationConfig], Physics]) -> None:
-    """Register a custom physics; its name is an option `physics` of single environments.
+    """Register a custom physics; `physics=name` then selects it in single environments.
 
     Args:
-        name: its name.
-        make: (`codrl_mj.physics.SimulationConfig`) -> a `codrl_mj.physics.Physics` that simulates
-            it.
+        name: value of `physics` that selects it.
+        make: (`codrl_mj.physics.SimulationConfig`) -> `codrl_mj.physics.Physics`.
 
     Raises:
         ValueError: the name belongs to another physics.

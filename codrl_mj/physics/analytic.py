@@ -13,7 +13,7 @@ class AnalyticPhysics(Physics):
     """A task simulated by Gymnasium's own equations."""
 
     def __init__(self, simulation: SimulationConfig) -> None:
-        """Make the Gymnasium environment.
+        """Create the task's Gymnasium environment.
 
         Raises:
             ValueError: something is added to the joint, for which Gymnasium's equations have no
@@ -33,8 +33,7 @@ class AnalyticPhysics(Physics):
         task = simulation.task
         if task.reference_env is None:
             raise ValueError(
-                f"physics = 'analytic': {task.name} rebuilds no environment of Gymnasium's; use"
-                " 'mujoco'"
+                f"physics = 'analytic': {task.name} has no counterpart in Gymnasium; use 'mujoco'"
             )
         super().__init__(simulation)
         self.timestep = simulation.timestep
@@ -80,7 +79,7 @@ class AnalyticPhysics(Physics):
         self.check_finite()
 
     def _advance(self, motor_index: int, command: float) -> tuple[float, ...]:
-        """Advance an actuator by one integration step; returns its force and its signals."""
+        """Advance an actuator by one integration step; return its force and its signals."""
         arm, parameters = self._actuators[motor_index]
         velocity_index = self.simulation.task.speed_indices[motor_index]
         position, speed = self.state[

@@ -37,7 +37,7 @@ def signal_names(family: Family) -> tuple[str, ...]:
 
 @functools.cache
 def make_info_reader(names: tuple[str, ...]) -> Callable[[Any], Signals]:
-    """Return a function that names columns: numbers of one actuator, or arrays of several.
+    """Return a function that turns a trace's columns, numbers or arrays, into `Signals`.
 
     The last entry is the flag `saturated`; if the family has no such signal, it is False in the
     columns' shape.
@@ -56,8 +56,8 @@ def make_info_reader(names: tuple[str, ...]) -> Callable[[Any], Signals]:
 
 
 MAX_STATE = 1e10
-"""Largest magnitude of a state entry: MuJoCo's `mjMAXVAL`, beyond which MuJoCo warns and discards
-forces. A diverging motor need not reach infinity then.
+"""Largest magnitude of a state entry, MuJoCo's `mjMAXVAL`. Beyond it MuJoCo warns and discards
+forces, so that a diverging simulation may stay finite.
 """
 
 
@@ -131,8 +131,7 @@ class Physics(abc.ABC):
     """
 
     stepping: Any = None
-    """Compiled functions of a loop (see `codrl_mj.physics.stepping.Stepping`); None if a step is
-    Python code.
+    """Compiled functions (see `codrl_mj.physics.stepping.Stepping`); None if a step is Python code.
     """
     pointers: int = 0
     """Address of the `PointerTable`, the last argument of the compiled functions; 0 if there are
@@ -182,7 +181,7 @@ class Physics(abc.ABC):
         """Change fields of the model, named as in `Variation.fields`; a reset must follow.
 
         Raises:
-            ValueError: the simulation has no MuJoCo model; no fields at all are always accepted.
+            ValueError: there are fields, but the simulation has no MuJoCo model.
         """
         if fields:
             physics_name = next(
@@ -199,7 +198,7 @@ class Physics(abc.ABC):
 
         Args:
             state: the mechanical state.
-            key: key of the random numbers of the episode's disturbances and sensors.
+            key: random key of the episode's disturbances and sensors.
         """
 
     @abc.abstractmethod
@@ -223,12 +222,12 @@ class Physics(abc.ABC):
 
     @property
     def memory(self) -> np.ndarray:
-        """State of the disturbances, a live array; empty without any."""
+        """State of the disturbances, a live array; empty without disturbances."""
         return self._disturber.memory.reshape(-1)
 
     @abc.abstractmethod
     def step(self, desired_force: Any) -> None:
-        """Advance by one environment step with a held desired force of at most `max_forces`.
+        """Advance by one environment step at a constant desired force of at most `max_forces`.
 
         Args:
             desired_force: a number; for several actuators an array (n,).
@@ -244,22 +243,22 @@ class Physics(abc.ABC):
             SimulationDivergedError: the simulation diverged.
         """
         state, task = self.state, self.simulation.task
-        # This fast test suffices in nearly all steps: every entry is below 1e5. It is false for
-        # NaN, too.
+        # This fast test, true if all entries are below about 1e5, suffices in nearly all steps. It
+        # is false for NaN, too.
         if state @ state <= MAX_STATE:
             return
         is_valid = np.abs(state) <= MAX_STATE
         if is_valid.all():
             return
-        broken = ", ".join(
+        invalid_entries = ", ".join(
             f"{n} = {v:g}"
             for n, v, valid in zip(task.state_names, state, is_valid, strict=True)
             if not valid
         )
-        raise divergence_error(task.name, self.time, broken)
+        raise divergence_error(task.name, self.time, invalid_entries)
 
     def show(self, state: np.ndarray) -> None:
-        """Move the bodies of `scene` to a state, for drawing; nothing else changes."""
+        """Move the bodies of `scene` to a state, for rendering; nothing else changes."""
         # Without a scene there is nothing to move.
         del state
 
@@ -273,13 +272,14 @@ class SimulationDivergedError(ArithmeticError):
 
 
 def divergence_error(
-    name: str, time: float, broken: str, step_setting: str = "inner_steps"
+    name: str, time: float, invalid_entries: str, step_setting: str = "inner_steps"
 ) -> SimulationDivergedError:
     """Return the error of a simulation that diverged at a time [s].
 
     `step_setting` is the name of the setting of its integration step.
     """
     return SimulationDivergedError(
-        f"{name}: the simulation diverged at t = {time:g} s: {broken}. Reset the environment; if"
-        f" this repeats, shorten the integration step ({step_setting}) or lower the gains"
+        f"{name}: the simulation diverged at t = {time:g} s: {invalid_entries}. Reset the"
+        f" environment; if this repeats, shorten the integration step ({step_setting})"
+        " or lower the gains"
     )

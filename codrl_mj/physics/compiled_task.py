@@ -1,4 +1,4 @@
-"""Compiled functions of a task, once per process: its outcomes, its bounds, and its state's order.
+"""Compiled functions of a task: its outcomes, its bounds, and the order of its state.
 
 Observation, reward and termination have one compiled form that all environments call, because the
 cosine of one library may differ from that of another in the last bit. Functions of MuJoCo's `qpos`
@@ -45,8 +45,8 @@ def compiled_constrain(
 ) -> Compiled | None:
     """Return (qpos, qvel, scratch (n,), step [s]) -> None, which applies `constrain` in place.
 
-    The result is None for a task without bounds. All entries of a state beyond `MAX_STATE` become
-    NaN, so that the divergence is detected: after the bounds it would look like any other state.
+    The result is None for a task without bounds. If an entry of the state exceeds `MAX_STATE`, all
+    entries become NaN, because the bounds would otherwise make a diverged state look valid.
     """
     if constrain is None:
         return None

@@ -33,7 +33,7 @@ def configure_actuator(
 
 
 def hills(model: mujoco.MjModel) -> list[int]:
-    """The joints of a compiled model that run over one of our hills (see `codrl_mj.engine.hill`).
+    """Return the joints of a model that run over one of our hills (see `codrl_mj.engine.hill`).
 
     Raises:
         ValueError: a joint carries our signature but not our layout.
@@ -59,14 +59,16 @@ def hills(model: mujoco.MjModel) -> list[int]:
 
 
 def needed_callbacks(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Return the callbacks that a compiled model needs, as `codrl_mj.engine.install` takes them.
+    """Return the groups of callbacks, as in `codrl_mj.engine.install`, that a model needs.
 
     Raises:
         ValueError: the user data of an actuator or joint has our signature, but not our layout.
     """
     # Actuators of the plugin backend need no callback.
-    called = [index for index in motors(model) if model.actuator_plugin[index] < 0]
-    return tuple(part for part, needed in (("motor", called), ("hill", hills(model))) if needed)
+    callback_motors = [index for index in motors(model) if model.actuator_plugin[index] < 0]
+    return tuple(
+        group for group, needed in (("motor", callback_motors), ("hill", hills(model))) if needed
+    )
 
 
 def install_callbacks(model: mujoco.MjModel) -> None:
@@ -79,19 +81,19 @@ def install_callbacks(model: mujoco.MjModel) -> None:
 
     Raises:
         ValueError: the user data of an actuator or joint has our signature, but not our layout.
-        CallbackInUseError: another program installed a callback; nothing was changed.
+        CallbackInUseError: another library installed a callback; nothing was changed.
     """
     for actuator in motors(model).values():
         engine.load_family(type(actuator))
-    parts = needed_callbacks(model)
-    if parts:
-        engine.install(*parts)
+    groups = needed_callbacks(model)
+    if groups:
+        engine.install(*groups)
 
 
 def task_model(simulation: SimulationConfig) -> mujoco.MjModel:
     """Compile the model of a simulation.
 
-    MuJoCo's automatic reset is disabled, so a diverging simulation diverges and can be reported.
+    MuJoCo's automatic reset is disabled, so that a divergence can be detected and reported.
     With the explicit Euler integrator, joint damping is explicit, too.
     """
     task = simulation.task
@@ -135,7 +137,7 @@ def task_model(simulation: SimulationConfig) -> mujoco.MjModel:
             if added.friction:
                 joint_driven.frictionloss += added.friction
                 spec.option.disableflags = flags_with_friction(spec.option.disableflags)
-    # The sky is ours to choose: without one, the background would be black.
+    # Without a skybox the background would be black.
     if all(texture.type != mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
         kind, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
         sky = spec.add_texture(type=kind, builtin=gradient, width=64, height=64)
@@ -153,7 +155,7 @@ def task_model(simulation: SimulationConfig) -> mujoco.MjModel:
 def _check_direct_drive(
     asset: str, option: mujoco.MjOption, motor: mujoco.MjsActuator, joint: mujoco.MjsJoint
 ) -> None:
-    """Raise if anything but our actuator changes the motor's force: it would go unreported."""
+    """Raise if the model itself changes the motor's force, which no signal would show."""
     elements = {
         "its gear": (
             list(motor.gear) != [1, 0, 0, 0, 0, 0] and tuple(motor.userdata)[:2] != SIGNATURE
@@ -174,10 +176,10 @@ _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def flags_with_friction(flags: int) -> int:
-    """Return the `disableflags` for joints with friction, from those for joints without.
+    """Return `disableflags` changed so that joints can have friction.
 
-    In MuJoCo friction is a constraint. It needs the solver, which the models disable. Warm starts
-    are disabled, so that a step depends on the state alone.
+    In MuJoCo friction is a constraint and needs the solver, which the tasks' models disable. Warm
+    starts are disabled, so that a step depends on the state alone.
     """
     return flags & ~int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(
         mujoco.mjtDisableBit.mjDSBL_WARMSTART

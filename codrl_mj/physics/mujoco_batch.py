@@ -1,4 +1,4 @@
-"""Many simulations of a task in MuJoCo at once: rows of arrays, stepped by several threads."""
+"""Many MuJoCo simulations of a task as rows of arrays, stepped by several threads."""
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,7 +45,7 @@ class MujocoBatchPhysics:
     ) -> None:
         """Compile the model and make the rows, one for each of N tuples of `actuators`.
 
-        The actuators are of the family of those in `simulation`; `num_threads` = 0 uses all CPUs.
+        All actuators must be of the family of `simulation`; `num_threads` = 0 uses all CPUs.
         """
         self.simulation, task = simulation, simulation.task
         self.num_envs, self._num_threads = len(actuators), num_threads
@@ -67,7 +67,7 @@ class MujocoBatchPhysics:
         self._bind()
         all_rows, (arms, additions) = np.arange(self.num_envs), arms_and_additions(actuators)
         self._arms[:] = arms
-        # If all actuators are those of the model, no row needs parameters of its own.
+        # If all actuators equal those of the model, the rows can share its parameters.
         if any(tuple(row) != simulation.actuators for row in actuators):
             self.set_parameters(
                 all_rows,
@@ -188,7 +188,7 @@ class MujocoBatchPhysics:
 
     def reset(self, rows: np.ndarray, states: np.ndarray, keys: np.ndarray | float = 0.0) -> None:
         """Start episodes of m simulations from states (m, n) with random keys (m,)."""
-        # Raises if another program replaced our callbacks since the last episodes.
+        # `install` raises if another library has replaced our callbacks since the last episodes.
         self._nominal.install()
         self._states[rows] = self._rest
         self._qpos[rows], self._qvel[rows] = states[:, self._positions], states[:, self._velocities]
@@ -219,20 +219,20 @@ class MujocoBatchPhysics:
 
     @property
     def memory(self) -> np.ndarray:
-        """State of the disturbances, a live array (N, k); (N, 0) without any."""
+        """State of the disturbances, a live array (N, k); (N, 0) without disturbances."""
         return self._disturber.memory.reshape(self.num_envs, -1)
 
     def check_finite(self, states: np.ndarray, rows: np.ndarray) -> None:
-        """Raise if a state in `rows`, a mask (N,), is not finite, with the simulation."""
+        """Raise if a state is not finite where the mask `rows` (N,) is True; name the first."""
         is_valid = np.abs(states) <= MAX_STATE
-        broken = np.flatnonzero(~is_valid.all(axis=1) & rows)
-        if len(broken) == 0:
+        diverged = np.flatnonzero(~is_valid.all(axis=1) & rows)
+        if len(diverged) == 0:
             return
-        first = broken[0]
+        first = diverged[0]
         entry = self.simulation.task.state_names[int(np.argmin(is_valid[first]))]
         value = states[first][np.argmin(is_valid[first])]
         raise SimulationDivergedError(
-            f"{self.simulation.task.name}: {len(broken)} of {len(states)} simulations diverged;"
+            f"{self.simulation.task.name}: {len(diverged)} of {len(states)} simulations diverged;"
             f" environment {first} at t = {self._time[first, 0]:g} s: {entry} = {value:g}. Reset"
             " them; if this repeats, shorten the integration step (inner_steps) or lower the gains"
         )
@@ -246,7 +246,7 @@ class MujocoBatchPhysics:
         self._states[:] = snapshot
 
     def show(self, index: int) -> None:
-        """Move `data` to the pose of one simulation, for drawing."""
+        """Move `data` to the pose of one simulation, for rendering."""
         self._nominal.show(self.state[index])
 
 

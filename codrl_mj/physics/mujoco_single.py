@@ -20,8 +20,8 @@ ARM = Wiring._fields.index("arm")
 class MujocoPhysics(Physics):
     """MJCF model and data of a task.
 
-    One `mj_step` is one integration step. CartPole's explicit Euler integrator then moves the
-    positions by the old velocity instead of the new one, which for slide and hinge joints is
+    One `mj_step` is one integration step. With CartPole's explicit Euler integrator the positions
+    then change by the old velocity instead of the new one. For slide and hinge joints this is
     exactly Gymnasium's update. If the task has bounds (`Task.constrain`), the state is moved back
     inside them after every integration step.
     """
@@ -33,7 +33,7 @@ class MujocoPhysics(Physics):
         self.data = mujoco.MjData(self.model)
         self._flags = self.model.opt.disableflags
         task = simulation.task
-        self._qpos_order, self._qvel_order = _progression(task.qpos), _progression(task.qvel)
+        self._qpos_order, self._qvel_order = _to_slice(task.qpos), _to_slice(task.qvel)
         self.wiring: list[Wiring] = []
         """Indices of the actuators' quantities in the model."""
         for name, actuator in zip(task.motors, simulation.actuators, strict=True):
@@ -57,7 +57,7 @@ class MujocoPhysics(Physics):
         self.reset(np.zeros(len(task.state_names)))
 
     def _bind(self) -> None:
-        """Take the views that a step uses, and ensure that the callbacks are installed."""
+        """Create the views that a step uses, and ensure that the callbacks are installed."""
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self.stepping = compiled_stepping(self.simulation)
         self.pointer_table = make_pointer_table(
@@ -69,7 +69,7 @@ class MujocoPhysics(Physics):
         self.install()
 
     def install(self) -> None:
-        """Ensure that the callbacks are installed; raise if others replaced them."""
+        """Ensure that the callbacks are installed; raise if another library replaced them."""
         if self._callbacks:
             engine.install(*self._callbacks)
 
@@ -104,7 +104,7 @@ class MujocoPhysics(Physics):
 
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
         """Start an episode; see `Physics.reset`."""
-        # Raises if another program replaced our callbacks since the last episode.
+        # `install` raises if another library has replaced our callbacks since the last episode.
         self.install()
         self.stepping.start(np.asarray(state, dtype=np.float64), float(key), self.pointers)
 
@@ -140,12 +140,12 @@ class MujocoPhysics(Physics):
         mujoco.mj_setConst(self.model, self.data)
 
     def show(self, state: np.ndarray) -> None:
-        """Update the body poses for `state`, for drawing; motor and episode do not change."""
+        """Update the body poses to `state`, for rendering; motor and episode do not change."""
         self._qpos[:] = state[self._qpos_order]
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
-        # On a hill, the passive-force callback lifts the car to its height.
+        # On a hill, the passive-force callback lifts the car to the surface.
         mujoco.mj_passive(self.model, self.data)
 
     def step(self, desired_force: Any) -> None:
@@ -173,7 +173,7 @@ class MujocoPhysics(Physics):
         mujoco.mj_setState(self.model, self.data, snapshot, _STATE)
 
 
-def _progression(entries: tuple[int, ...]) -> slice:
+def _to_slice(entries: tuple[int, ...]) -> slice:
     """Return an arithmetic progression as a slice, with which numpy is faster than with a list."""
     stride = entries[1] - entries[0] if len(entries) > 1 else 1
     return slice(entries[0], entries[-1] + 1, stride)

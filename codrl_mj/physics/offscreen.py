@@ -26,10 +26,10 @@ _fatal: list[mujoco.FatalError] = []
 
 @functools.cache
 def _watch_process() -> None:
-    """Free open contexts at exit while the OpenGL library is loaded; later it would complain.
+    """Free open contexts at exit, before the OpenGL library shuts down.
 
-    It must be called after the first context is created: the library registers its own shutdown
-    then, and the last function registered runs first. A forked process creates new contexts.
+    Call it after the first context was created, because that registers the library's own shutdown,
+    and functions registered later run earlier. A forked process creates new contexts.
     """
 
     @atexit.register
@@ -39,14 +39,14 @@ def _watch_process() -> None:
 
     # Windows has no fork.
     if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=_leave_to_parent)
+        os.register_at_fork(after_in_child=_abandon_after_fork)
 
 
-def _leave_to_parent() -> None:
-    """Abandon contexts and display after a fork: waiting for the renderer's lost threads hangs.
+def _abandon_after_fork() -> None:
+    """Abandon contexts and display after a fork, where waiting for the lost threads would hang.
 
-    A software renderer's threads stay in the parent process. A display of another platform has
-    threads of its own; if no other platform is available, the inherited display is used.
+    A software renderer's threads stay in the parent process. A display of another EGL platform
+    starts new threads; if no other platform is available, the inherited display is used.
     """
     egl: Any = sys.modules.get("mujoco.egl")
     if egl is None:
@@ -91,7 +91,7 @@ class OffscreenRenderer:
             width: image width [px], at most the model's `offwidth`.
             height: image height [px], at most the model's `offheight`.
             camera: name of a camera of the model.
-            pretty: shadows, reflections and multisampling, for still images.
+            pretty: True to render shadows, reflections and multisampling, for still images.
 
         Raises:
             ValueError: unknown camera, or a size out of bounds.
@@ -110,7 +110,7 @@ class OffscreenRenderer:
         _watch_process()
 
     def _make(self) -> mujoco.Renderer:
-        """Create the renderer; its frame buffer has the image's size to clear no more."""
+        """Create the renderer; its frame buffer is no larger than the image, to save clearing."""
         egl: Any = sys.modules.get("mujoco.egl")
         limits, (width, height) = self._model.vis.global_, self._size
         largest = limits.offwidth, limits.offheight
@@ -176,7 +176,7 @@ class OffscreenRenderer:
         return image
 
     def close(self) -> None:
-        """Free the OpenGL context; harmless if repeated or already ended elsewhere."""
+        """Free the OpenGL context; harmless if it is closed already."""
         renderer, self._renderer = getattr(self, "_renderer", None), None
         if renderer is None:
             return
@@ -203,12 +203,12 @@ def _only_sky_is_black(model: mujoco.MjModel) -> bool:
     Everything else must be lit by the headlight's ambient part, be opaque, and have no texture.
     """
     light = model.vis.headlight
-    colours = np.vstack([model.geom_rgba, model.site_rgba, model.mat_rgba])
+    colors = np.vstack([model.geom_rgba, model.site_rgba, model.mat_rgba])
     return bool(
         light.active
         and (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).all()
-        and (colours[:, 3] == 1).all()
-        and colours[:, :3].min(initial=1) * light.ambient.min() > 2 / 255
+        and (colors[:, 3] == 1).all()
+        and colors[:, :3].min(initial=1) * light.ambient.min() > 2 / 255
     )
 
 
@@ -260,7 +260,7 @@ class Window:
     """Window that shows images one after another, no faster than a frame rate."""
 
     def __init__(self, width: int, height: int) -> None:
-        """Open a window for images of a size [px]."""
+        """Open a window for images of this size [px]."""
         try:
             import pygame
         except ImportError:

@@ -2,7 +2,7 @@
 
 Everything that differs between two simulations of a task is in a row of arrays: the engine's state,
 fields of the model, the arms and the disturbances' memory. A thread has one simulation (`Lane`). It
-loads a row, steps or observes it like any simulation, and stores the row again.
+loads a row, steps or observes the simulation, and stores the row again.
 """
 
 from collections.abc import Mapping
@@ -50,8 +50,8 @@ class Lane(NamedTuple):
     """Simulation of one thread, and the addresses to which the parts of a row are copied."""
 
     fields: np.ndarray
-    """For each model field in the rows: its address, the address of the first row's value, and the
-    bytes from row to row and of a value; shape (f, 4).
+    """For each model field in the rows: its address, the address of the first row's value, the
+    stride of rows [bytes] and the size of a value [bytes]; shape (f, 4).
     """
     parts: np.ndarray
     """For each part of the state: its address in the data, its first entry in a row, its length;
@@ -65,7 +65,7 @@ class Lane(NamedTuple):
 
 
 def state_slice(model: mujoco.MjModel, name: str) -> slice:
-    """Return the slice of a row of states that holds a part of the engine's state, by name."""
+    """Return the slice of a state row that holds a named part of the engine's state."""
     # MuJoCo stores the parts of a state in the order of their flags, so the sizes of all lower
     # flags add up to the first index.
     flag = int(_STATE_PARTS[name])
@@ -76,7 +76,7 @@ def state_slice(model: mujoco.MjModel, name: str) -> slice:
 def make_lane(
     physics: MujocoPhysics, data: mujoco.MjData, fields: Mapping[str, np.ndarray]
 ) -> Lane:
-    """Return a lane for a thread's own data and model, with these fields in the rows."""
+    """Return a lane for the data of a thread; `fields` are the model fields in the rows."""
     rows = [
         (field_address(data.model, name), values.ctypes.data, values.strides[0], values[0].nbytes)
         for name, values in fields.items()
@@ -105,7 +105,7 @@ def load_fields(row: int, lane: Lane) -> None:
 
 @internal
 def load(rows: Rows, row: int, lane: Lane) -> None:
-    """Turn the lane's simulation into that of a row."""
+    """Load a row into the lane's simulation."""
     load_fields(row, lane)
     lane.pointer_table[_MEMORY] = rows.memory.ctypes.data + row * rows.memory.strides[0]
     state = rows.states.ctypes.data + row * rows.states.strides[0]

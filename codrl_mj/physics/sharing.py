@@ -1,8 +1,8 @@
 """Threads that share the rows of a batch, step after step.
 
 One thread leads: it begins a turn, takes part in it and ends it. The others help: they wait for
-turns in compiled code, where they do not need the interpreter, and sleep if no turn started for a
-while. The threads communicate through a board of counters for each batch.
+turns in compiled code, where they do not need the interpreter, and sleep if no turn has started for
+a while. The threads communicate through a board of counters for each batch.
 """
 
 import atexit
@@ -22,17 +22,17 @@ from codrl_mj.engine.memory import atomic_add, atomic_load, internal
 from codrl_mj.physics.compiled_task import Compiled
 
 _MIN_STEPS_PER_THREAD = 64
-"""Integration steps per thread from which waking another thread pays off."""
-_ROUNDS_BEFORE_SLEEP, _LOOKS_PER_ROUND = 1000, 500
-"""Number of rounds in which a thread looks for the next turn before it sleeps, about a millisecond
-in total, and of looks in a round, after which it yields its CPU.
+"""Minimum number of integration steps per thread that makes another thread worth waking."""
+_ROUNDS_BEFORE_SLEEP, _POLLS_PER_ROUND = 1000, 500
+"""Number of rounds in which a thread polls for the next turn before it sleeps, about a millisecond
+in total; and number of polls per round, after which it yields its CPU.
 """
 _yield_cpu = external_function(
     "offer_cpu",
     ctypes.windll.kernel32.SwitchToThread if os.name == "nt" else ctypes.CDLL(None).sched_yield,  # type: ignore[attr-defined]
     types.int32(),
 )
-CLAIMED, BROKEN, TURN, HELPING = range(0, 32, 8)
+CLAIMED, DIVERGED, TURN, HELPING = range(0, 32, 8)
 """Indices of a board's counters, each in its own cache line: rows claimed, simulations that
 diverged, turns started plus turns ended (odd during a turn), and threads that help in the present
 turn.
@@ -46,9 +46,9 @@ def num_cpus() -> int:
 
 def cache_aligned_copy(array: np.ndarray) -> np.ndarray:
     """Return a copy on its own cache lines; writes to shared lines are several times slower."""
-    room = np.empty(array.nbytes + 128, np.uint8)
-    start = -room.ctypes.data % 64
-    copy = room[start : start + array.nbytes].view(array.dtype).reshape(array.shape)
+    buffer = np.empty(array.nbytes + 128, np.uint8)
+    start = -buffer.ctypes.data % 64
+    copy = buffer[start : start + array.nbytes].view(array.dtype).reshape(array.shape)
     copy[...] = array
     return copy
 
@@ -73,17 +73,17 @@ def _read(board: np.ndarray, entry: int) -> int:
 @internal
 def _wait_for_helpers(board: np.ndarray) -> None:
     """Wait until no thread helps."""
-    looks = 0
+    polls = 0
     while _read(board, HELPING):
-        looks += 1
-        if looks % _LOOKS_PER_ROUND == 0:
+        polls += 1
+        if polls % _POLLS_PER_ROUND == 0:
             _yield_cpu()
 
 
 @internal
 def _begin_turn(board: np.ndarray) -> int:
     """Begin a turn; return its number."""
-    board[CLAIMED] = board[BROKEN] = 0
+    board[CLAIMED] = board[DIVERGED] = 0
     return _add(board, TURN, 1) + 1
 
 
@@ -91,10 +91,10 @@ def _begin_turn(board: np.ndarray) -> int:
 def _join_turn(board: np.ndarray, last: int) -> int:
     """Join a turn other than the last one as a helper; return 0 if none starts in time."""
     for _ in range(_ROUNDS_BEFORE_SLEEP):
-        for _ in range(_LOOKS_PER_ROUND):
+        for _ in range(_POLLS_PER_ROUND):
             turn = _read(board, TURN)
             if turn % 2 == 1 and turn != last:
-                # The turn may end between the two looks: then the thread must not count as a
+                # The turn may have ended since the first poll; then the thread must not count as a
                 # helper.
                 _add(board, HELPING, 1)
                 if _read(board, TURN) == turn:
@@ -107,7 +107,7 @@ def _join_turn(board: np.ndarray, last: int) -> int:
 def make_shared_kernel(function: Compiled) -> Compiled:
     """Return a kernel (leads, board, rows, threads, lane, arguments) -> None that shares rows.
 
-    A leader leads one turn; a helper helps in turns until none starts in a short while. `function`
+    A leader runs one turn; a helper joins turns until none starts for a while. `function`
     is a compiled function (first row, end row, lane, *arguments) -> number of simulations that
     diverged. Threads claim rows until none are left, in smaller portions as fewer are left: no
     thread waits long for another one, and a late thread delays no other.
@@ -121,7 +121,9 @@ def make_shared_kernel(function: Compiled) -> Compiled:
             claimed = count if threads == 1 else max(1, remaining // (4 * threads))
             first = _add(board, CLAIMED, claimed)
             if first < count:
-                _add(board, BROKEN, function(first, min(first + claimed, count), lane, *arguments))
+                _add(
+                    board, DIVERGED, function(first, min(first + claimed, count), lane, *arguments)
+                )
 
     @njit(nogil=True, error_model="numpy")
     def take_part(
@@ -151,12 +153,12 @@ class _Worker:
     def _work(self) -> None:
         while (task := self.tasks.get()) is not None:
             function, board, *arguments = task
-            # An error occurs before the thread helps, and the leader meets the same error.
+            # An error can occur only before the thread helps, and the leader raises it as well.
             with contextlib.suppress(Exception):
                 function(False, board, *arguments)
             if self.board is board:
                 self.board = None
-            # Otherwise the arguments would stay alive while the thread sleeps.
+            # References in this frame would keep the arguments alive while the thread sleeps.
             del task, board, arguments
 
 
@@ -184,8 +186,8 @@ def run_shared(
 ) -> bool:
     """Run a kernel of `make_shared_kernel` on rows of `steps` integration steps each.
 
-    There are at most as many threads as lanes. The same board always comes with the same lanes and
-    arguments. Returns True if a simulation diverged.
+    There are at most as many threads as lanes. A board must always be used with the same lanes and
+    arguments. Return True if a simulation diverged.
     """
     threads = min(len(lanes), 1 + count * steps // _MIN_STEPS_PER_THREAD)
     for helper_index in range(threads - 1):
@@ -197,4 +199,4 @@ def run_shared(
             worker.board = board
             worker.tasks.put((function, board, count, threads, lanes[helper_index + 1], arguments))
     function(True, board, count, threads, lanes[0], arguments)
-    return bool(board[BROKEN])
+    return bool(board[DIVERGED])

@@ -1,10 +1,10 @@
 """Compiled environment step of one simulation in MuJoCo.
 
-Compiled functions get a simulation as one number, `pointers`: the address of its `PointerTable`.
-`settings` has a row for each actuator, a `Wiring` followed by `DisturberParameters`; `memory` is
-the disturber's, with a row for each actuator; `trace` is that of `Physics`. All of them are live:
-changing them changes the simulation. Options and observation belong to the environment, see
-`codrl_mj.envs.compiled`.
+Compiled functions identify a simulation by one integer, `pointers`: the address of its
+`PointerTable`. `settings` has a row for each actuator, a `Wiring` followed by
+`DisturberParameters`; `memory` is that of the disturber, with a row for each actuator; `trace` is
+that of `Physics`. All are live: changing them changes the simulation. Options and observation
+belong to the environment, see `codrl_mj.envs.compiled`.
 """
 
 import functools
@@ -61,7 +61,7 @@ NUM_WIRING = len(Wiring._fields)
 
 
 class PointerTable(NamedTuple):
-    """Addresses and sizes of a simulation: an int64 array that must live as long."""
+    """Addresses and sizes of a simulation, in an int64 array that must live as long as it."""
 
     model: int
     """Address, like the next six entries."""
@@ -72,7 +72,7 @@ class PointerTable(NamedTuple):
     options: int
     observation: int
     actuators: int
-    """Number of actuators, followed by the lengths of their rows."""
+    """Number of actuators; the next two entries are the lengths of their rows."""
     settings_columns: int
     memory_columns: int
     inner_steps: int
@@ -124,8 +124,8 @@ class Stepping(NamedTuple):
 
     step: Compiled
     """(force, pointers) -> True if the state is valid, within `MAX_STATE`: takes one environment
-    step under a desired force [N or N*m], or an array (n,) of several. What the actuators did is in
-    `trace`.
+    step under a desired force [N or N*m], or an array (n,) of several. The actuators' signals are
+    in `trace`.
     """
     start: Compiled
     """(state (n,), key, pointers) -> None, which starts an episode like `Physics.reset`."""
@@ -160,9 +160,10 @@ def force_of(forces: Any, actuator: int) -> float:
     return forces[actuator] if isinstance(forces, np.ndarray) else forces
 
 
-# An overload is not inlined by numba. Inlined, it would drop stores through pointers as dead code.
+# numba does not inline an overload. Inlining this function would drop stores through pointers as
+# dead code.
 @overload(force_of)
-def _force_of(forces, actuator):  # type: ignore[no-untyped-def]  # noqa: ARG001 - numba compares the arguments
+def _force_of(forces, actuator):  # type: ignore[no-untyped-def]  # noqa: ARG001 - numba compares the arguments' names
     if isinstance(forces, types.Array):
         return lambda forces, actuator: forces[actuator]
     return lambda forces, actuator: forces  # noqa: ARG005
@@ -195,9 +196,11 @@ def _stepping(
                 wiring = read_row(settings[actuator], Wiring)
                 command = force_of(force, actuator)
                 if disturbed:
-                    numbers = read_row(settings[actuator, NUM_WIRING:], DisturberParameters)
+                    disturber_parameters = read_row(
+                        settings[actuator, NUM_WIRING:], DisturberParameters
+                    )
                     command, DATA.qfrc_applied(data)[int(wiring.dof)] = disturb(
-                        numbers, memory[actuator], command
+                        disturber_parameters, memory[actuator], command
                     )
                 ctrl[int(wiring.ctrl)] = command * wiring.arm
                 trace[inner, actuator, 0] = command

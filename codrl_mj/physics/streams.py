@@ -1,4 +1,4 @@
-"""Many NumPy generators, drawn from at once, with the same numbers as one by one."""
+"""Batch of NumPy generators that gives the same numbers as drawing from them one by one."""
 
 import ctypes
 from collections.abc import Sequence

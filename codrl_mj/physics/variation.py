@@ -16,7 +16,7 @@ from codrl_mj.physics.mjcf import hills, task_model
 from codrl_mj.tasks import TASKS
 
 VISUAL_FIELDS = ("geom_pos", "geom_size")
-"""Fields that affect only pictures."""
+"""Fields that affect only rendering."""
 _FIELDS = {
     "mass": ("body_mass", "body_inertia"),
     "length": ("body_ipos", "body_inertia", "body_pos", *VISUAL_FIELDS),
@@ -91,7 +91,7 @@ def arms_and_additions(motors: Sequence[Sequence[ActuatorModel]]) -> tuple[np.nd
 
 
 def variable_names(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Return the names of everything in a model that can be varied."""
+    """Return the names of all quantities of a model that can be varied."""
     bodies = {
         body: model.body(body).name for body in range(1, model.nbody) if model.body(body).name
     }
@@ -105,22 +105,22 @@ def variable_names(model: mujoco.MjModel) -> tuple[str, ...]:
 def _has_length(model: mujoco.MjModel, body: int) -> bool:
     """Return True if `model.length.BODY` can scale a body.
 
-    Its joints must be hinges at its origin, its center of mass on its z axis, and it must not touch
-    anything.
+    Its joints must be hinges at its origin, its center of mass must be on its z axis, and the model
+    must have no contacts or other constraints.
     """
     joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
-    turns = all(
+    has_only_hinges = all(
         model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_pos[joint].any()
         for joint in joints
     )
     flags = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
-    touches = (
+    has_contacts = (
         model.geom_contype | model.geom_conaffinity
     ).any() and not model.opt.disableflags & flags
-    is_constrained = touches or model.ntendon or model.neq
+    is_constrained = has_contacts or model.ntendon or model.neq
     x, y, z = model.body_ipos[body]
     return (
-        turns
+        has_only_hinges
         and bool(z)
         and x == y == 0.0
         and list(model.body_iquat[body]) == [1.0, 0.0, 0.0, 0.0]
@@ -129,7 +129,7 @@ def _has_length(model: mujoco.MjModel, body: int) -> bool:
 
 
 class Variation:
-    """Effect of numbers on the fields of a compiled model.
+    """Effect of varied quantities on the fields of a compiled model.
 
     `model.mass.BODY` multiplies the body's mass and inertia. `model.length.BODY` multiplies all
     distances along the body (its center of mass, attached bodies, its geoms) and, squared, its
@@ -144,7 +144,7 @@ class Variation:
         motors: Sequence[int] = (),
         vary_additions: bool = False,
     ) -> None:
-        """Find the fields that are varied by names of `variable_names(model)`.
+        """Find the fields that the quantities `names`, from `variable_names(model)`, change.
 
         `motors` are the indices of actuators whose additions are not in the model; `vary_additions`
         varies these, too.
@@ -159,6 +159,7 @@ class Variation:
             if address is not None
         ] * vary_additions
         self._nominal = {field: field_of(model, field).copy() for field in fields}
+        # Damping is added and everything else multiplied, so the neutral values are 0 and 1.
         self._neutral = np.array([float(not name.startswith("model.damping.")) for name in names])
         self._bodies = {model.body(body).name: body for body in range(model.nbody)}
         self._dofs = {
@@ -166,7 +167,7 @@ class Variation:
         }
         self._parents = model.body_parentid.copy()
         self._geom_bodies = model.geom_bodyid.copy()
-        self._geoms_along = _along(model)
+        self._geoms_along = _geoms_along_axis(model)
         self._hills = hills(model)
 
     def fields(
@@ -175,12 +176,10 @@ class Variation:
         """Return the varied fields, shape (m, ...), by name (`opt.` before an option's).
 
         `values`, shape (m, k), has a column for each of `names`, NaN for the nominal value;
-        `additions` are as in `arms_and_additions`; `shown` includes the fields that affect only
-        pictures.
+        `additions` are as in `arms_and_additions`; `shown` includes the `VISUAL_FIELDS`.
         """
         fields = {
             field: np.repeat(nominal[np.newaxis], len(values), axis=0)
-            # Damping is added and everything else multiplied, so the neutral values are 0 and 1.
             for field, nominal in self._nominal.items()
             if shown or field not in VISUAL_FIELDS
         }
@@ -219,8 +218,8 @@ class Variation:
         return fields
 
 
-def _along(model: mujoco.MjModel) -> dict[int, int]:
-    """Return geoms along their body's z axis, with the index of their half length."""
+def _geoms_along_axis(model: mujoco.MjModel) -> dict[int, int]:
+    """Return geom -> index in `geom_size` of the half length, for geoms along the body's z axis."""
     kinds = mujoco.mjtGeom
     entries = {
         # Indices in `geom_size` of half the length along the geom's z axis.

@@ -174,7 +174,7 @@ def test_actuators_that_cannot_share_a_motor_raise(attributes, pattern, actuator
 def test_an_actuator_past_a_motor_causes_a_warning():
     with pytest.warns(
         MotorWarning,
-        match="actuator hip_v drives the joint of hip_p past its motor: 'hip_p & hip_v'",
+        match="actuator hip_v drives the joint of hip_p without its motor: 'hip_p & hip_v'",
     ):
         codrl_mj.add_motors(_pair(), {"hip_p": "lag"})
 
@@ -286,7 +286,7 @@ def test_a_chosen_motor_is_for_both_actuators():
     class Choice:
         name = "any"
 
-        def behind(self, gear):  # noqa: ARG002
+        def for_model_gear(self, gear):  # noqa: ARG002
             return Lag()
 
     class Demand:

@@ -176,8 +176,8 @@ def test_raises_for_a_bad_argument_of_a_vector_environment(make, arguments, mess
         ({"autoreset_mode": "Sometimes"}, "'Sometimes' is not a valid AutoresetMode"),
         ({"render_mode": "human"}, "render_mode = 'human': must be one of None, rgb_array"),
         ({"render_mode": "rgb_array", "camera": "far"}, "camera = 'far'"),
-        ({"actuator": [STABLE, "ideal", STABLE]}, "actuator[1] = 'ideal': must be an Actuator"),
-        ({"actuator": ["weak", None, "weak"]}, "actuator[1] = None: must be an Actuator"),
+        ({"actuator": [STABLE, "ideal", STABLE]}, "actuator[1] = 'ideal': must not be ideal"),
+        ({"actuator": ["weak", None, "weak"]}, "actuator[1] = None: must not be ideal"),
         (
             {"actuator": ["weak", "weka", "weak"]},
             "actuator[1]: unknown actuator 'weka': did you mean 'weak'?",

@@ -428,7 +428,10 @@ def test_an_episode_is_filmed_with_the_strip_of_a_motor(reacher, capsys):
             "train Reacher-v5 --env.options nope=3",
             "options = .*nope.*Reacher-v5 does not take them",
         ),
-        ("train Reacher-v5 --env.options action=1", "'action' is no argument of the environment's"),
+        (
+            "train Reacher-v5 --env.options action=1",
+            "'action' is not an argument of the environment",
+        ),
         ("train Reacher-v5 --env.randomize motor.resistance", "must be FIELD=DISTRIBUTION"),
         ("train HalfCheetah-v5 --actuators bthigh", "must be PATTERN=NAME"),
         ("train Cheetah-v5", "Cheetah.* doesn't exist"),
