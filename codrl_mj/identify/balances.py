@@ -232,7 +232,7 @@ class Shift(NamedTuple):
     """The time shift at which two signals agree best."""
 
     lag: float  # [s]
-    improvement: float  # residual at that shift over the residual without a shift; small is good
+    residual_ratio: float  # residual at that shift over the residual without a shift
     gain: float  # factor between the two signals
     unexplained: float  # RMS of the residual at that shift over the RMS of the target
     noise: float = 0.0  # noise-to-signal ratio of the worse sensor, quantization included

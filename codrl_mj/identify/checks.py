@@ -332,7 +332,7 @@ def _velocity(facts: LogFacts) -> Iterator[Finding]:
         )
         yield Finding("error", "unit", None, text, "correct the unit of velocity, position or time")
     rows = abs(shift.lag) / facts.log.step
-    if (rows > 0.75 and shift.improvement < 0.7) or (rows > 2.0 and shift.improvement < 0.85):
+    if (rows > 0.75 and shift.residual_ratio < 0.7) or (rows > 2.0 and shift.residual_ratio < 0.85):
         late = "after" if shift.lag > 0.0 else "before"
         text = (
             f"the velocity comes {1e3 * abs(shift.lag):.3g} ms {late} the differentiated position"
@@ -414,7 +414,7 @@ def _delay(facts: LogFacts) -> Iterator[Finding]:
     if shift is None or shift.unexplained > 0.3:
         return
     rows = shift.lag / log.step
-    if abs(rows) >= 0.7 and shift.improvement < 0.55:
+    if abs(rows) >= 0.7 and shift.residual_ratio < 0.55:
         late = "after" if rows > 0.0 else "before"
         text = (
             f"the current comes {abs(rows):.2g} rows ({1e3 * abs(shift.lag):.3g} ms) {late} the"
@@ -429,7 +429,7 @@ def _delay(facts: LogFacts) -> Iterator[Finding]:
         )
     # A voltage that was sampled at the time of a row represents the time from half a row before to
     # half a row after it, but the balance holds it until the next row: it seems half a row late.
-    elif -0.8 < rows < -0.2 and shift.improvement < 0.8:
+    elif -0.8 < rows < -0.2 and shift.residual_ratio < 0.8:
         declared = (
             "declared as the mean to the next row" if log.mean_voltage else "held to the next row"
         )
@@ -498,7 +498,7 @@ def _mechanical(facts: LogFacts) -> Iterator[Finding]:
             " 0.3 s)"
         )
         lag = effort_lag(log, effort)
-        if lag is not None and abs(lag.lag) > log.step and lag.improvement < 0.9:
+        if lag is not None and abs(lag.lag) > log.step and lag.residual_ratio < 0.9:
             text += f"; {lag.unexplained:.0%} if the motion came {1e3 * lag.lag:.3g} ms later"
         remedy = (
             "something else moves the shaft, or the columns were not sampled at the same time:"

@@ -203,8 +203,9 @@ def feasibility(
     """Judge whether a motor can meet a demand.
 
     The bounds of `SUFFICIENT` are sufficient together. `stall` and `power` are necessary to follow
-    the demand, and therefore exclude a motor only if the demand is exact: otherwise another policy
-    may need less. `swing` is necessary for every policy.
+    the demand, and exclude a motor if the demand is exact. Otherwise another policy may need less,
+    so that they exclude only a motor without any stall torque. `swing` is necessary for every
+    policy.
 
     Args:
         drive: motor with gear and supply; a rotor inertia of 0 counts as unknown.
