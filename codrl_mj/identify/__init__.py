@@ -1,4 +1,4 @@
-"""Motors from their bench logs."""
+"""Identification of motors from bench logs."""
 
 from codrl_mj.identify.checks import check
 from codrl_mj.identify.identify import identify

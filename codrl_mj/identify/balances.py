@@ -1,4 +1,4 @@
-"""Voltage and torque balances of a log by linear regression without differentiation, and lags.
+"""Regressions of the voltage and torque balances of a log, and time lags between its signals.
 
 Both balances are multiplied by functions phi whose value and slope vanish at both ends of a window,
 and integrated by parts: the derivatives move from the signals to phi. Source: Shinbrot, *On the
@@ -15,24 +15,27 @@ import numpy as np
 
 from codrl_mj.identify.log import Log, gapless_stretches, sensor_deviation
 
-_MIN_ROWS = 12  # of a window
-_MAX_LAG_ROWS = 20_000  # rows of a log from its start that a lag is estimated from
+_MIN_ROWS = 12
+"""Smallest number of rows in a window."""
+_MAX_LAG_ROWS = 20_000
+"""Largest number of rows, from the start of a log, in the estimate of a lag."""
 _MAX_LAG_WINDOWS = 400  # more windows do not make a lag more accurate
-# The power of s - s^2 is so high that the trapezoidal rule is accurate for phi'' too.
+# With the fifth power, phi'' is smooth at both ends of a window, so that the trapezoidal rule
+# integrates it accurately.
 _BUMP = np.polynomial.Polynomial([0.0, 1.0, -1.0]) ** 5
-_UNIT = _BUMP / _BUMP.integ()(1.0)
-_PHI = {-1: _UNIT.integ(), 0: _UNIT, 1: _UNIT.deriv(), 2: _UNIT.deriv(2)}
+_UNIT_BUMP = _BUMP / _BUMP.integ()(1.0)
+_PHI = {-1: _UNIT_BUMP.integ(), 0: _UNIT_BUMP, 1: _UNIT_BUMP.deriv(), 2: _UNIT_BUMP.deriv(2)}
 """Order of phi's derivative with respect to the phase -> polynomial; -1: its integral."""
 NONNEGATIVE_TERMS = ("inertia", "viscous", "coulomb")
 """Terms of a torque balance that are never negative for a physical body and its friction."""
 
 
 class Balance(NamedTuple):
-    """The result of a regression over the windows of a log."""
+    """Result of a regression over the windows of a log."""
 
     values: Mapping[str, float]  # term -> its coefficient
-    certainty: Mapping[str, float]  # term -> its coefficient over its standard error
-    unexplained: float  # root mean square of the residual over that of the target
+    t_values: Mapping[str, float]  # term -> its coefficient over its standard error
+    unexplained: float  # RMS of the residual over the RMS of the target
     residual: float  # root mean square of the residual, in the unit of the target
 
 
@@ -40,7 +43,7 @@ class Windows:
     """Overlapping windows of a log, which weight signals by phi ~ (s - s^2)^5, s in [0, 1]."""
 
     def __init__(self, log: Log, duration: float = 0.0, max_windows: int = 20_000) -> None:
-        """Cut a log into windows of a duration [s], or of the smallest number of rows."""
+        """Cut a log into windows of a duration [s], but of at least `_MIN_ROWS` rows."""
         # At least ten windows have to fit into the log.
         duration = min(duration, float(log.time[-1] - log.time[0]) / 10.0)
         count = max(math.ceil(duration / log.step), _MIN_ROWS)
@@ -61,7 +64,7 @@ class Windows:
         self._weights: dict[int, np.ndarray] = {}
 
     def mean(self, signal: str | np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the weighted mean of a signal's derivative of an order, shape (windows,)."""
+        """Return the weighted mean of a signal's `order`-th derivative, shape (windows,)."""
         values = (self._log.signals[signal] if isinstance(signal, str) else signal)[self.rows]
         # A constant has no derivative: subtracting the mean avoids the rounding errors of a large
         # offset.
@@ -76,13 +79,16 @@ class Windows:
         )
 
     def mean_held(self, signal: str, lag: float = 0.0) -> np.ndarray:
-        """Return the weighted mean of a signal held until the next row, shape (windows,)."""
+        """Return the weighted mean of a signal with a zero-order hold, shape (windows,).
+
+        The signal is delayed by `lag` [s].
+        """
         values, time = self._log.signals[signal], self._log.time
-        # A lag moves rows from beside a window into it.
+        # With a lag, rows outside a window act within it.
         reach = 0 if lag == 0.0 else math.ceil(abs(lag) / self._log.step) + 1
         rows = np.arange(-reach, self.rows.shape[1] - 1 + reach) + self.rows[:, :1]
         rows = np.clip(rows, 0, len(time) - 2)
-        # A held signal is integrated exactly, by the integral of phi between the edges of its rows.
+        # A zero-order hold is integrated exactly: each value times the integral of phi over a row.
         edges = [
             np.clip((time[rows + k] + lag - self.begin) / self.length, 0.0, 1.0) for k in (0, 1)
         ]
@@ -128,10 +134,10 @@ def regress(
     # phi is about half as wide as its window, so that neighboring windows share about half of their
     # rows. Only half of the windows count as independent.
     variance = 2.0 * error**2 * np.sum(np.linalg.pinv(matrix * weights[:, None]) ** 2, axis=1)
-    certainty = solution / np.sqrt(np.maximum(variance, 1e-300))
+    t_values = solution / np.sqrt(np.maximum(variance, 1e-300))
     return Balance(
         dict(zip(terms, map(float, solution / scales), strict=True)),
-        dict(zip(terms, map(float, certainty), strict=True)),
+        dict(zip(terms, map(float, t_values), strict=True)),
         error / math.sqrt(float(np.mean((weights * target) ** 2))),
         error,
     )
@@ -207,15 +213,14 @@ def torque_balance(
     `constant`.
 
     Args:
-        log: with the effort, and a position or a velocity. A velocity without a position is
+        log: log with the effort, and a position or a velocity. A velocity without a position is
             integrated from the angle 0, at which the pendulum hangs.
         effort: `torque`, `current` or `voltage`.
-        duration: of the windows [s].
-        is_tilted: whether to add `gravity_aside`*cos(q), for a pendulum that hangs beside 0.
-        rig: without gravity (`free`, `load`) there is no term of gravity; None counts as a
-            pendulum.
-        sign: 1 or -1 multiplies the effort, and forbids negative inertia and friction; 0 allows
-            them.
+        duration: duration of the windows [s].
+        is_tilted: True to add `gravity_aside`*cos(q), for a pendulum that does not hang at 0.
+        rig: `pendulum` or None for a gravity term; `free` or `load` for none.
+        sign: 1 or -1 multiplies the effort and forbids negative inertia and friction; 0 leaves the
+            effort unchanged and allows them.
     """
     windows = Windows(log, duration)
     terms = _torque_terms(log, windows, is_tilted, rig)
@@ -227,14 +232,14 @@ class Shift(NamedTuple):
     """The time shift at which two signals agree best."""
 
     lag: float  # [s]
-    improvement: float  # residual at that shift over the residual without a shift
+    residual_ratio: float  # residual at that shift over the residual without a shift
     gain: float  # factor between the two signals
-    unexplained: float  # residual at that shift over the target, root mean squares
-    noise: float = 0.0  # noise or resolution of the worse sensor over its signal
+    unexplained: float  # RMS of the residual at that shift over the RMS of the target
+    noise: float = 0.0  # noise-to-signal ratio of the worse sensor, quantization included
 
 
 def velocity_lag(log: Log) -> Shift | None:
-    """Return lag (up to 0.1 s) and gain of the velocity against the differentiated position."""
+    """Estimate lag (up to 0.1 s) and gain of the velocity relative to the position's derivative."""
     log = log.slice_rows(slice(0, _MAX_LAG_ROWS))
     windows = Windows(log, max(0.05, 4.0 * log.step), _MAX_LAG_WINDOWS)
     rate = windows.mean("position", 1)
@@ -263,7 +268,7 @@ def velocity_lag(log: Log) -> Shift | None:
 
 
 def effort_lag(log: Log, effort: str) -> Shift | None:
-    """Return the lag of a response to an effort, by the residual of their balance.
+    """Estimate the lag of a response to an effort, which minimizes the residual of their balance.
 
     The response to a `voltage` is the current, with a lag of up to 20 rows; the response to a
     `torque` is the motion, with a lag of up to 60 ms.
@@ -282,9 +287,9 @@ def effort_lag(log: Log, effort: str) -> Shift | None:
 
     def compare(lag: float) -> tuple[float, float, float]:
         balance = regress(windows.mean_held(effort, lag), terms)
-        # With a nearly sinusoidal current a delay cannot be distinguished from a larger inductance,
-        # and too long a delay is compensated by a negative inductance.
-        if balance is None or (lag > 0.0 and balance.certainty.get("inductance", 0.0) < -3.0):
+        # With a nearly sinusoidal current a delay cannot be distinguished from a larger inductance.
+        # Too long a delay is compensated by a negative inductance, and is rejected for that reason.
+        if balance is None or (lag > 0.0 and balance.t_values.get("inductance", 0.0) < -3.0):
             return np.inf, 1.0, 1.0
         return balance.residual, 1.0, balance.unexplained
 
@@ -299,7 +304,7 @@ def _search_lag(
     max_lead: float,
     max_lag: float,
 ) -> Shift:
-    """Return the shift with the smallest residual, to a quarter of a step.
+    """Search for the shift with the smallest residual, with a resolution of a quarter of a step.
 
     A coarse grid is refined around its best point. `compare` returns the residual, the gain and the
     unexplained share at a lag.

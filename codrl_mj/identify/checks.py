@@ -1,4 +1,4 @@
-"""Checks of a log before a fit, each with the signals and facts that it needs."""
+"""Checks of a log before a fit, each registered with the conditions under which it applies."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -28,10 +28,11 @@ from codrl_mj.identify.log import (
 from codrl_mj.identify.parameters import PARAMETERS
 from codrl_mj.identify.signal_checks import signal_findings
 
-_DROPPED_STEPS = 1.5  # median steps; rows are missing within a longer step
+_DROPPED_STEPS = 1.5
+"""Time step, in median steps, above which rows are missing."""
 _MAX_LISTED = 10  # gaps that are reported one by one
-# The limits are beyond the largest motors of robots and beyond 190,000 rpm. A duty of 1 may be
-# rounded up.
+# No motor of a robot exceeds these limits; 2e4 rad/s are 190,000 rpm. A duty is at most 1, but its
+# rounding or scaling may make it slightly larger.
 _MAX_VALUES = {
     "duty": 1.1,
     "voltage": 1e3,
@@ -51,25 +52,31 @@ FACTORS = {
     "degrees for turns": 360.0,
     "rpm for turn/s": 60.0,
 }
-"""Confusion of units -> factor, or its inverse, between two numbers that should be equal."""
+"""Mix-up of units -> factor by which two values that should be equal differ, or its inverse."""
 # The smallest resistance would draw 1 kA at 5 V; micromotors have some hundreds of ohms.
 _RESISTANCES = (5e-3, 1e4)
 """Range of plausible resistances of motors on a bench [ohm]."""
-_MIN_CERTAINTY = 10.0  # coefficient over its standard error
-_MAX_FLIPPED_RESIDUAL = 2.0 / 3.0  # share of the residual that remains if a flipped sign is right
-_MAX_NOISE = 0.1  # noise over motion; beyond it no error of the velocity is reported
-_MIN_TILT = 0.03  # angle [rad] between the hanging pendulum and position 0 that is reported
+_MIN_T_VALUE = 10.0
+"""Smallest coefficient over its standard error that counts as significant."""
+_MAX_FLIPPED_RESIDUAL = 2.0 / 3.0
+"""Largest residual with a flipped sign, over the residual with the logged one, at which the logged
+sign counts as wrong.
+"""
+_MAX_NOISE = 0.1
+"""Noise-to-signal ratio above which no error of the velocity is reported."""
+_MIN_TILT = 0.03
+"""Smallest reported angle [rad] between the hanging pendulum and position 0."""
 
 
 class LogFacts(NamedTuple):
-    """A log under examination, with all that several checks use."""
+    """A log to be checked, with values that several checks use."""
 
     log: Log
     motor: Any  # the `GearMotor` of a datasheet, or None
     rig: str | None
-    effort: str  # the logged input that is nearest to the shaft; empty without one
-    conditions: set[str]  # words of `CHECKS`: signals, and facts about them
-    winding: Balance | None  # R, L and kE by the voltage; None if the voltage does not change
+    effort: str  # logged input that is nearest to the shaft; empty if there is none
+    conditions: set[str]  # signals of the log and facts about it, as named in `CHECKS`
+    winding: Balance | None  # R, L and kE from the voltage balance; None if it has no solution
 
 
 CHECKS: list[tuple[set[str], Callable[[LogFacts], Iterator[Finding]]]] = []
@@ -90,11 +97,11 @@ def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
     """Return all findings about a log, errors first.
 
     Args:
-        log: as it was read.
-        motor: the `GearMotor` of a datasheet, to compare with; None skips these checks.
+        log: log, as read from its file.
+        motor: `GearMotor` of a datasheet, to compare with; None skips the comparison.
         rig: `pendulum`, `free` or `load`; None counts as a pendulum.
     """
-    # The torque is nearest to the shaft: the later signals act through the winding.
+    # The torque is nearest to the shaft; current and voltage act on the shaft through the winding.
     effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), "")
     conditions = {*log.signals, *(["effort"] if effort else []), *(["datasheet"] if motor else [])}
     if log.has("position") or log.has("velocity"):
@@ -130,7 +137,7 @@ def explain_factor(ratio: float, angle: bool = True) -> str:
 
 @_needs("")
 def _obstacle(facts: LogFacts) -> Iterator[Finding]:
-    """Find the reason for which a fit of this log would be refused."""
+    """Find the reason why a fit would refuse this log."""
     if finding := find_obstacle([facts.log]):
         yield finding
 
@@ -164,7 +171,7 @@ def _times(facts: LogFacts) -> Iterator[Finding]:
         )
         severity = "warning" if share > 0.01 else "info"
         yield Finding(severity, "dropped rows", int(rows[dropped[0] + 1]), text, remedy)
-    # The steps in which rows are missing would count as jitter.
+    # Steps with missing rows are left out, because they would count as jitter.
     regular = steps[steps <= _DROPPED_STEPS * usual]
     jitter = float(np.std(regular)) / usual
     if jitter > 0.02:
@@ -172,8 +179,8 @@ def _times(facts: LogFacts) -> Iterator[Finding]:
             np.argmax(np.where(steps <= _DROPPED_STEPS * usual, np.abs(steps - usual), 0.0))
         )
         text = (
-            f"steps of {regular.min():.3g} to {regular.max():.3g} s about {usual:.3g} s,"
-            f" {jitter:.0%} of it"
+            f"steps of {regular.min():.3g} to {regular.max():.3g} s around {usual:.3g} s,"
+            f" with a standard deviation of {jitter:.0%}"
         )
         remedy = "take each stamp when the values are read"
         yield Finding(
@@ -206,7 +213,7 @@ def _sizes(facts: LogFacts) -> Iterator[Finding]:
     for signal in _MAX_VALUES.keys() & facts.log.signals.keys():
         # The quantile ignores outliers.
         largest = float(np.quantile(np.abs(facts.log.signals[signal]), 0.99))
-        unit = SIGNALS[signal] or "of 1"
+        unit = SIGNALS[signal] or "times the bus voltage"
         if largest > _MAX_VALUES[signal]:
             text = (
                 f"the {signal} is up to {largest:.4g} {unit}, must be at most"
@@ -221,20 +228,20 @@ def _sizes(facts: LogFacts) -> Iterator[Finding]:
     log, voltage = facts.log, np.abs(facts.log.signals["voltage"])
     responses = [log.signals[name] for name in ("current", "torque", "velocity") if log.has(name)]
     if log.has("position"):
-        # The flicker of an encoder is negligible beside the motion over many rows.
+        # Over many rows the motion is much larger than the quantization of an encoder.
         rows, position = max(len(log.time) // 20, 1), log.signals["position"]
         responses.append(position[rows:] - position[:-rows])
     if is_supply_voltage(log.signals["voltage"], responses):
         text = (
-            f"the voltage stays near {np.median(voltage):.3g} V while the motor goes both ways: it"
-            " is the supply's"
+            f"the voltage stays near {np.median(voltage):.3g} V while the motor turns both ways: it"
+            " is the voltage of the supply"
         )
         yield Finding(
             "error",
             "voltage",
             None,
             text,
-            "write bus=column:V, and log the motor's own voltage or its duty",
+            "write bus=column:V, and log the voltage at the motor or its duty",
         )
     if log.has("bus"):
         excess = voltage / np.maximum(np.abs(log.signals["bus"]), 1e-9)
@@ -261,7 +268,7 @@ def _degrees(facts: LogFacts) -> Iterator[Finding]:
         radians, degrees = (
             torque_balance(variant, effort, is_tilted=True) for variant in (log, converted)
         )
-        pulls = degrees is not None and degrees.certainty.get("gravity", 0.0) > _MIN_CERTAINTY
+        pulls = degrees is not None and degrees.t_values.get("gravity", 0.0) > _MIN_T_VALUE
         if (
             radians
             and degrees
@@ -287,7 +294,7 @@ def _degrees(facts: LogFacts) -> Iterator[Finding]:
                 f"the position's steps of {step:.4g} are 1/{count} of 360, not of 2 pi: is it in"
                 " degrees?"
             )
-            # A file that rounds radians to decimals has such steps too: then it is only a warning.
+            # Radians rounded to decimals in a file have such steps, too: then it is only a warning.
             decimal = round(step / 10.0 ** math.floor(math.log10(step)), 5) in (1.0, 2.0, 2.5, 5.0)
             encoder = not decimal and (count % 100 == 0 or count & (count - 1) == 0)
             yield Finding("error" if encoder else "warning", "unit", None, text, remedy)
@@ -302,7 +309,7 @@ def _velocity(facts: LogFacts) -> Iterator[Finding]:
     clear = shift.noise < _MAX_NOISE
     if shift.unexplained > 0.5:
         text = (
-            "velocity and differentiated position have nothing in common: the position leaves"
+            "velocity and differentiated position do not agree: the position leaves"
             f" {shift.unexplained:.0%} of the velocity unexplained"
         )
         if clear:
@@ -325,19 +332,19 @@ def _velocity(facts: LogFacts) -> Iterator[Finding]:
         )
         yield Finding("error", "unit", None, text, "correct the unit of velocity, position or time")
     rows = abs(shift.lag) / facts.log.step
-    if (rows > 0.75 and shift.improvement < 0.7) or (rows > 2.0 and shift.improvement < 0.85):
+    if (rows > 0.75 and shift.residual_ratio < 0.7) or (rows > 2.0 and shift.residual_ratio < 0.85):
         late = "after" if shift.lag > 0.0 else "before"
         text = (
             f"the velocity comes {1e3 * abs(shift.lag):.3g} ms {late} the differentiated position"
             f" ({rows:.2g} rows)"
         )
-        remedy = "leave the velocity out, so that the position alone is fitted, or fit its delay"
+        remedy = "leave the velocity out, so that only the position is fitted"
         yield Finding("warning", "lag", None, text, remedy)
 
 
 @_needs("voltage current")
 def _electrical(facts: LogFacts) -> Iterator[Finding]:
-    """Check the signs and the certainty of R, L and kE."""
+    """Check the signs, the sizes and the significance of R, L and kE."""
     balance = facts.winding
     if balance is None:
         text = "voltage or current do not change, or too few rows follow each other without a gap"
@@ -349,15 +356,15 @@ def _electrical(facts: LogFacts) -> Iterator[Finding]:
             "log while the voltage changes; see codrl-mj identify plan",
         )
         return
-    values, certainty = balance.values, balance.certainty
-    if certainty["resistance"] < -_MIN_CERTAINTY:
+    values, t_values = balance.values, balance.t_values
+    if t_values["resistance"] < -_MIN_T_VALUE:
         text = (
             f"the resistance would be {values['resistance']:.3g} ohm: the current flows against the"
             " voltage"
         )
         yield Finding("error", "sign", None, text, "give one of them a minus: current=-column:A")
     elif (
-        certainty["resistance"] > _MIN_CERTAINTY
+        t_values["resistance"] > _MIN_T_VALUE
         and not _RESISTANCES[0] <= values["resistance"] <= _RESISTANCES[1]
     ):
         text = (
@@ -366,10 +373,10 @@ def _electrical(facts: LogFacts) -> Iterator[Finding]:
         )
         remedy = "correct the unit of voltage or current: current=column:mA if it is in mA"
         yield Finding("error", "unit", None, text, remedy)
-    elif certainty.get("back_emf_constant", 0.0) < -_MIN_CERTAINTY:
+    elif t_values.get("back_emf_constant", 0.0) < -_MIN_T_VALUE:
         text = (
-            f"the back-EMF constant would be {values['back_emf_constant']:.3g} V*s/rad: the motor"
-            " turns against it"
+            f"the back-EMF constant would be {values['back_emf_constant']:.3g} V*s/rad: the speed"
+            " has the opposite sign"
         )
         remedy = "give position and velocity a minus, or voltage and current"
         yield Finding("error", "sign", None, text, remedy)
@@ -377,10 +384,10 @@ def _electrical(facts: LogFacts) -> Iterator[Finding]:
         ("inductance", "quickly: a PRBS"),
         ("back_emf_constant", "speed: a slow sine"),
     ):
-        if name in values and abs(certainty[name]) < _MIN_CERTAINTY:
+        if name in values and abs(t_values[name]) < _MIN_T_VALUE:
             text = (
-                f"the {name.replace('_', ' ')} hardly shows: it is {abs(certainty[name]):.2g}"
-                " standard errors"
+                f"the log hardly shows the {name.replace('_', ' ')}: its estimate is only"
+                f" {abs(t_values[name]):.2g} standard errors"
             )
             yield Finding(
                 "info",
@@ -407,7 +414,7 @@ def _delay(facts: LogFacts) -> Iterator[Finding]:
     if shift is None or shift.unexplained > 0.3:
         return
     rows = shift.lag / log.step
-    if abs(rows) >= 0.7 and shift.improvement < 0.55:
+    if abs(rows) >= 0.7 and shift.residual_ratio < 0.55:
         late = "after" if rows > 0.0 else "before"
         text = (
             f"the current comes {abs(rows):.2g} rows ({1e3 * abs(shift.lag):.3g} ms) {late} the"
@@ -418,11 +425,11 @@ def _delay(facts: LogFacts) -> Iterator[Finding]:
             "lag",
             None,
             text,
-            "fit with a scan over delays, or shift a column of the log",
+            "check the delay that the fit reports, or shift a column of the log",
         )
-    # A voltage that was sampled at the row's time is on average that of half a row earlier and half
-    # a row later, whereas the balance integrates it from the row on.
-    elif -0.8 < rows < -0.2 and shift.improvement < 0.8:
+    # A voltage that was sampled at the time of a row represents the time from half a row before to
+    # half a row after it, but the balance holds it until the next row: it seems half a row late.
+    elif -0.8 < rows < -0.2 and shift.residual_ratio < 0.8:
         declared = (
             "declared as the mean to the next row" if log.mean_voltage else "held to the next row"
         )
@@ -449,10 +456,10 @@ def _sag(facts: LogFacts) -> Iterator[Finding]:
     if balance is None or sagging is None or sagging.residual > 0.96 * balance.residual:
         return
     supply, winding = sagging.values["supply_resistance"], sagging.values["resistance"]
-    if sagging.certainty["supply_resistance"] > _MIN_CERTAINTY and supply > 0.03 * winding > 0.0:
+    if sagging.t_values["supply_resistance"] > _MIN_T_VALUE and supply > 0.03 * winding > 0.0:
         text = (
-            f"the voltage sags as with {supply:.2g} ohm in the supply, beside {winding:.2g} ohm in"
-            " the winding"
+            f"the voltage sags as if the supply had {supply:.2g} ohm, while the winding has"
+            f" {winding:.2g} ohm"
         )
         remedy = "log the voltage of the supply, and write voltage=duty*bus:V"
         yield Finding("warning", "sag", None, text, remedy)
@@ -470,11 +477,11 @@ def _mechanical(facts: LogFacts) -> Iterator[Finding]:
     ]
     if not balances:
         return
-    balance, certainty = balances[0], balances[0].certainty
-    inertias = [fit.certainty.get("inertia", 0.0) for fit in balances]
+    balance, t_values = balances[0], balances[0].t_values
+    inertias = [fit.t_values.get("inertia", 0.0) for fit in balances]
     inertia = max(inertias, key=abs) if max(inertias) < 3.0 else 0.0
-    is_negative = inertia < -_MIN_CERTAINTY or (
-        certainty.get("gravity", 0.0) < -_MIN_CERTAINTY and inertia < -3.0
+    is_negative = inertia < -_MIN_T_VALUE or (
+        t_values.get("gravity", 0.0) < -_MIN_T_VALUE and inertia < -3.0
     )
     if is_negative and (shares := _explain_sign(log, effort, rig)):
         remedy = f"give the {effort}, or position and velocity, a minus"
@@ -491,7 +498,7 @@ def _mechanical(facts: LogFacts) -> Iterator[Finding]:
             " 0.3 s)"
         )
         lag = effort_lag(log, effort)
-        if lag is not None and abs(lag.lag) > log.step and lag.improvement < 0.9:
+        if lag is not None and abs(lag.lag) > log.step and lag.residual_ratio < 0.9:
             text += f"; {lag.unexplained:.0%} if the motion came {1e3 * lag.lag:.3g} ms later"
         remedy = (
             "something else moves the shaft, or the columns were not sampled at the same time:"
@@ -501,7 +508,7 @@ def _mechanical(facts: LogFacts) -> Iterator[Finding]:
 
 
 def _explain_sign(log: Log, effort: str, rig: str | None) -> str:
-    """Return how much better the effort fits with a minus, or an empty text.
+    """Return a text on how much better the effort fits with a minus; empty if it does not.
 
     The check by standard errors alone may be wrong where static friction holds the shaft, or where
     a controller produces the effort from the motion.
@@ -531,7 +538,7 @@ def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
     names = "gravity", "gravity_aside"
     if (
         balance is None
-        or max(abs(balance.certainty.get(name, 0.0)) for name in names) < _MIN_CERTAINTY
+        or max(abs(balance.t_values.get(name, 0.0)) for name in names) < _MIN_T_VALUE
     ):
         return
     along, aside = (balance.values.get(name, 0.0) for name in names)
@@ -570,11 +577,11 @@ def _motion(facts: LogFacts) -> Iterator[Finding]:
 def _two_constants(facts: LogFacts) -> Iterator[Finding]:
     """Compare the torque constant with the back-EMF constant.
 
-    In SI units they are equal but for losses and the convention of star or delta windings.
+    In SI units they are equal, except for losses and the convention for star or delta windings.
     """
     # The speed of longer windows is less affected by the resolution of an encoder.
     balance = facts.winding and (voltage_balance(facts.log, 0.1) or facts.winding)
-    if balance is None or balance.certainty.get("back_emf_constant", 0.0) < _MIN_CERTAINTY:
+    if balance is None or balance.t_values.get("back_emf_constant", 0.0) < _MIN_T_VALUE:
         return
     back_emf = balance.values["back_emf_constant"]
     current, torque = facts.log.signals["current"], facts.log.signals["torque"]
@@ -599,7 +606,7 @@ def _datasheet(facts: LogFacts) -> Iterator[Finding]:
     motor, balance = facts.motor, facts.winding
     constant = motor.back_emf_constant * motor.gear_ratio
     for name, value in (("resistance", motor.resistance), ("back_emf_constant", constant)):
-        if balance is None or balance.certainty.get(name, 0.0) <= _MIN_CERTAINTY or value <= 0.0:
+        if balance is None or balance.t_values.get(name, 0.0) <= _MIN_T_VALUE or value <= 0.0:
             continue
         logged = balance.values[name]
         if abs(math.log(logged / value)) > math.log(2.0):

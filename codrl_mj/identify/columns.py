@@ -20,7 +20,7 @@ COLUMN_UNITS: dict[str, str | None] = {
 }
 """Signal that columns can be mapped to -> its SI unit; None: any."""
 OPEN_UNIT = "UNIT"
-"""Placeholder of a proposal for a unit that the user has to fill in."""
+"""Placeholder in a proposed mapping for a unit that the user has to fill in."""
 EXAMPLES = {
     "time": "s, ms or us",
     "voltage": "V or mV",
@@ -39,13 +39,13 @@ _EXAMPLE = "time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad"
 
 
 def twos_complement(values: Any, bits: Any) -> Any:
-    """Return the signed values of unsigned numbers in two's complement: 65535 of 16 bits is -1."""
+    """Return unsigned numbers read as two's complement: 65535 with 16 bits is -1."""
     whole = 2.0 ** float(bits)
     return (np.asarray(values) + whole / 2.0) % whole - whole / 2.0
 
 
 def sign_magnitude(values: Any, bits: Any) -> Any:
-    """Return the values of numbers whose highest bit is the sign: 1324 of 11 bits is -300."""
+    """Return unsigned numbers read with a sign in the highest bit: 1324 with 11 bits is -300."""
     half = 2.0 ** (float(bits) - 1.0)
     return np.where(np.asarray(values) >= half, half - np.asarray(values), values)
 
@@ -91,7 +91,7 @@ class Column:
         bare = self._formula[2]
         kind = COLUMN_UNITS[self.signal]
         if self.unit == OPEN_UNIT:
-            remedy = f"write the column's own, such as {EXAMPLES[self.signal]}"
+            remedy = f"write the unit of the column, such as {EXAMPLES[self.signal]}"
             raise self._error(f"the unit is not filled in; {remedy}. The file does not state it")
         if self.unit is not None:
             self._quantity(1.0)
@@ -134,8 +134,8 @@ class Column:
             body = ast.parse(self.formula.strip(), mode="eval").body
         except SyntaxError as error:
             raise ValueError(
-                f"columns: {self.signal}={self.formula}: no formula ({error.msg}); write a column's"
-                f" name, in quotes if it has spaces, as in {_EXAMPLE}"
+                f"columns: {self.signal}={self.formula}: not a formula ({error.msg}); write the"
+                f" name of a column, in quotes if it has spaces, as in {_EXAMPLE}"
             ) from None
         value, names = self._compile(body)
         return value, names - {"pi"}, isinstance(body, ast.Name | ast.Constant | ast.Subscript)

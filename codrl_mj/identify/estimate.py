@@ -22,17 +22,17 @@ DIFFERENCE_STEP = 1e-4
 MAX_SQUARED_RESIDUALS = 1e30
 """Sum of squared residuals beyond which a simulation counts as diverged."""
 SCREENING_EVALUATIONS = 12
-"""Evaluations from each of several starts, before the best are optimized further."""
+"""Evaluations from each start, before the two best fits are optimized further."""
 DELAYS = (-1, 1, 2, 3)
 """Delays of the input [rows] that are tried besides 0."""
 MAX_DELAY = 20
-"""Largest delay [rows]; delays beyond `DELAYS` are tried while they are better."""
+"""Largest delay [rows]; delays beyond `DELAYS` are tried while the cost falls."""
 NUM_STARTS = 4
 # A delay is accepted if it passes both limits.
 MAX_COST_RATIO = 0.8
-"""Largest robust cost with an accepted delay, over the cost without it."""
+"""Largest accepted ratio of the robust cost with a delay to the cost without it."""
 MIN_DEVIATIONS = 3.0
-"""Smallest mean reduction of the segments' costs, in standard deviations of that mean."""
+"""Smallest accepted mean reduction of the segments' costs, in standard errors."""
 # Beyond both limits the log is faulty, or the model does not describe it.
 MAX_MEAN_RESIDUAL = 8.0
 """Largest mean residual that may be noise, in standard deviations of the sensor."""
@@ -87,12 +87,12 @@ class Model(abc.ABC):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
-    """Fitted parameters, and all that is needed to judge them."""
+    """Fitted parameters, with the residuals and Jacobians from which their intervals follow."""
 
     model: Any  # a `Model`
     segments: Sequence[Segment]
     values: np.ndarray  # free parameters, shape (p,)
-    # Residuals beyond the scale, in standard deviations of the sensor, are outliers.
+    # Residuals above this scale, in standard deviations of the sensor, count as outliers.
     scale: float
     # Residuals of each segment in standard deviations of the sensor, shape (m,).
     residuals: tuple[np.ndarray, ...]
@@ -159,7 +159,7 @@ def _fit_state(
         # The weights of the soft-L1 loss make it a sum of weighted squares.
         root, cost = (1.0 + (residuals / scale) ** 2) ** -0.25, robust_cost(residuals, scale)
         step = np.linalg.lstsq(root[:, None] * columns, -root * residuals, rcond=1e-9)[0]
-        # The predicted reduction of the cost is negligible.
+        # Stop if the predicted reduction of the cost is negligible.
         if np.sum((root * (columns @ step)) ** 2) < 1e-6 * cost:
             break
         for share in (1.0, 0.25):
@@ -182,7 +182,8 @@ def best_initial_state(model: Model, values: np.ndarray, segment: Segment) -> np
 class _Problem:
     """The outer least-squares problem in the parameters, for scipy.
 
-    The initial states are fitted from those at the last Jacobian, extrapolated linearly.
+    Each evaluation fits the initial states, starting from those at the last Jacobian, which are
+    extrapolated linearly in the parameters.
     """
 
     def __init__(
@@ -255,7 +256,7 @@ class _Problem:
 
 
 def robust_scale(residuals: np.ndarray) -> float:
-    """Return 1.5 standard deviations of the residuals without outliers, and at least 1.5."""
+    """Return 1.5 robust standard deviations of the residuals, but at least 1.5."""
     return 1.5 * max(1.4826 * float(np.median(np.abs(residuals))), 1.0)
 
 
@@ -303,12 +304,12 @@ def optimize(
     """Fit the free parameters of a model to segments.
 
     Args:
-        model: with its free parameters.
-        segments: to fit.
+        model: model with its free parameters.
+        segments: segments to fit.
         start: initial guess, shape (p,).
-        max_evaluations: 0 leaves the parameters at the start.
-        scale: beyond which residuals count as outliers; None takes it from the residuals at the
-            start.
+        max_evaluations: largest number of evaluations; 0 leaves the parameters at the start.
+        scale: residual above which a residual counts as an outlier; None derives it from the
+            residuals at the start.
         states: initial states of the segments; None fits them at the start.
     """
     from scipy.optimize import least_squares
@@ -340,8 +341,8 @@ def optimize(
             gtol=1e-10,
         ).x
     problem.scale = robust_scale(problem.residuals(values))
-    # Dry friction gives a segment several minima: the state that was followed from the start may be
-    # a worse one.
+    # With dry friction the cost of a segment has several minima over its initial state, and the
+    # state that was tracked from the start may be in a worse one.
     problem.choose_best_states(values)
     jacobians = problem.jacobians(values)
     state_fits = problem.solve(values)
@@ -351,7 +352,7 @@ def optimize(
 
 
 def refit_model(fit: Fit, model: Model) -> Fit:
-    """Fit another model to the logs of a fit, from its parameters."""
+    """Fit another model to the logs of a fit, starting from the parameters of that fit."""
     segments = model.segments(fit.logs)
     refit = optimize(model.initial_guess(segments)[0], segments, fit.values)
     return dataclasses.replace(refit, logs=fit.logs, delay=fit.delay, start_fits=fit.start_fits)
@@ -360,10 +361,10 @@ def refit_model(fit: Fit, model: Model) -> Fit:
 def fit_model(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None) -> Fit:
     """Fit a model to logs from several starts, and then the delay of its input.
 
-    For a winding, delays of half a row are tried too. If they fit worse than whole rows, the
-    voltage is held from row to row: then it is also the mean between rows, of which a log at half
-    the rate can be made. If a half row fits better, the voltage was sampled at the times of the
-    rows, and is delayed accordingly.
+    For a winding, delays of half a row are tried, too. If they fit clearly worse, the voltage was
+    held between rows, so that each value is also the mean until the next row (`mean_voltage`). If
+    one fits clearly better, the voltage was sampled at the times of the rows, and that delay is
+    kept.
     """
     segments = model.segments(logs)
     model, starts = model.initial_guess(segments)
@@ -388,7 +389,7 @@ def fit_model(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = l
         return best if _is_better(costs[best], costs[0]) else 0
 
     delay = try_delays(*DELAYS)
-    # The best delay is at an end of those that were tried: the next one may be better.
+    # While the best delay is the first or the last of those tried, the next one may be better.
     while delay != 0 and delay in (min(costs), max(costs)) and abs(delay) < MAX_DELAY:
         delay = try_delays(delay + (1 if delay > 0 else -1))
     shifted_logs = delayed_logs(delay)
@@ -409,7 +410,7 @@ def fit_model(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = l
 
 
 def _is_better(costs: np.ndarray, reference: np.ndarray) -> bool:
-    """Return True if the costs of segments are lower than others, by more than chance."""
+    """Return True if the costs of the segments are significantly below reference costs."""
     reductions = reference - costs
     error = reductions.std(ddof=1) / np.sqrt(len(reductions)) if len(reductions) > 1 else 0.0
     return bool(
@@ -422,8 +423,8 @@ def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
     """Return warnings about the logs or the model of a fit.
 
     Args:
-        fit: of a model to logs.
-        shares: gets the unexplained share of each log that the model does not explain.
+        fit: fit of a model to logs.
+        shares: output; receives the unexplained share of each log that the model explains poorly.
     """
     unexplained: dict[str, str] = {}
     for index, log in enumerate(fit.logs):

@@ -15,8 +15,8 @@ from codrl_mj.identify.result import predict
 MIN_LOGS = 3
 """Smallest number of moving logs for a cross-validation."""
 _LOADED = {"coulomb": "load", "stribeck": "both"}
-"""Friction model -> the same model with an efficiency of the gear."""
-# A hint has to pass both limits.
+"""Friction model -> the same model with a gear efficiency."""
+# A gear efficiency is suggested only if it passes both limits.
 _MAX_COST_RATIO = 0.9
 """Largest ratio of costs with and without an efficiency, in total and in the median segment."""
 _MIN_DIFFERENCE = 0.05
@@ -86,7 +86,7 @@ def _left_out_errors(
 
 
 def load_hint(fit: Fit) -> str | None:
-    """Return the advice to fit an efficiency if that explains the same logs clearly better."""
+    """Return advice to fit a gear efficiency if it explains the logs clearly better; else None."""
     model = fit.model
     if model.friction not in _LOADED or "gear_efficiency" in (*model.known, *model.names):
         return None

@@ -24,10 +24,10 @@ from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import (
     DEFAULTS,
     ESTIMABLE,
-    OF_LOSS,
-    OF_RIG,
-    OF_WINDING,
+    LOSS_PARAMETERS,
     PARAMETERS,
+    RIG_PARAMETERS,
+    WINDING_SOURCES,
 )
 from codrl_mj.identify.result import (
     MAX_UNEXPLAINED,
@@ -43,7 +43,7 @@ from codrl_mj.identify.result import (
 from codrl_mj.identify.uncertainty import assess_fits, correlations
 
 STEPS_PER_PART = 8 + 4
-"""Progress steps of a part: its fit, and the assessment of its uncertainty."""
+"""Progress steps for each part: for its fit, and for the assessment of its uncertainty."""
 
 
 def identify(
@@ -61,22 +61,22 @@ def identify(
     """Identify a motor from its logs.
 
     Args:
-        logs: to fit, at least one; `check` finds their faults, and no fault is corrected here.
+        logs: logs to fit, at least one; `check` finds their faults, and none is corrected here.
             Voltage and current determine the winding. Torque, current or voltage, together with
             position or velocity, determine the shaft.
-        rig: what the output moves: `pendulum`, `free` or `load`. None is allowed if `mgl` is known,
-            and then means a pendulum.
+        rig: kind of load at the output: `pendulum`, `free` or `load`. None is allowed if `mgl` is
+            known, and then means a pendulum.
         known: values of parameters that are not fitted, by names of `PARAMETERS`.
         friction: `coulomb` (viscous and Coulomb), `stribeck`, `load`, `both`, or `auto`, which
-            chooses the model that predicts logs best that it was not fitted to.
+            chooses the model with the best predictions of logs that are left out of the fit.
         held_out: logs that are predicted, but not fitted.
         estimated: parameters to fit that otherwise have a default, such as `torque_gain`.
-        segment: time [s] that the shaft is simulated for at once, >= 0.05: short if the shaft is
-            unstable, a second or two if it only sticks and slides.
-        base: the mapping of a drive, for parameters that the logs do not determine, and for the
-            gear ratio if it is not in `known`.
+        segment: duration [s] of the segments in which the shaft is simulated, >= 0.05: short if
+            the shaft is unstable, 1 or 2 s if it only sticks and slides.
+        base: mapping of a drive, which supplies the parameters that the logs do not determine, and
+            the gear ratio if it is not in `known`.
         on_progress: called with the name of the task, the steps done and the number of steps.
-        seed: of the resampling.
+        seed: seed of the resampling.
 
     Raises:
         ValueError: a name is unknown, a value is out of bounds, or the logs lack signals; the
@@ -87,7 +87,9 @@ def identify(
         check_arguments(logs, rig, known or {}, friction, estimated, segment, base),
         base_motor(base),
     )
-    defaults = DEFAULTS | {name: getattr(motor, name) for name in OF_LOSS if motor is not None}
+    defaults = DEFAULTS | {
+        name: getattr(motor, name) for name in LOSS_PARAMETERS if motor is not None
+    }
     rig = rig or ("pendulum" if "mgl" in fixed else "free")
     electrical, moving, driven_by, output = assign_logs(logs)
     total = STEPS_PER_PART * max(bool(electrical) + bool(moving), 1) + 4 * len(moving) * (
@@ -152,8 +154,8 @@ def identify(
         friction_reason=choice.reason if driven_by else "",
     )
     if _may_need_voltage(identified, moving):
-        # With few rows in a time constant of the winding, the current may be useless for the
-        # back-EMF constant, which the voltage alone determines.
+        # If a time constant of the winding has only few rows, the logged current may not determine
+        # the back-EMF constant. A fit with the voltage as the input may still determine it.
         without_current = [_without_current(log) for log in logs]
         arguments = rig, known, friction, held_out, estimated, segment, base, on_progress, seed
         identified = _better_identified(identified, identify(without_current, *arguments))
@@ -161,7 +163,7 @@ def identify(
 
 
 def _may_need_voltage(identified: Identified, moving: Sequence[Log]) -> bool:
-    """Return True if the shaft has no usable constant under the current, but a logged voltage."""
+    """Return True if the current gave no usable back-EMF constant, but the voltage may."""
     is_refused = any(
         estimate.name == "back_emf_constant" and estimate.status not in USABLE
         for estimate in identified.estimates
@@ -177,7 +179,7 @@ def _without_current(log: Log) -> Log:
 
 
 def _better_identified(under_current: Identified, under_voltage: Identified) -> Identified:
-    """Return the shaft from the fit with fewer refusals, with the winding under the current."""
+    """Join the winding fitted under the current and the shaft of the fit with fewer refusals."""
     refused = [
         sum(
             estimate.status not in USABLE and estimate.name != "inductance"
@@ -213,11 +215,11 @@ def _better_identified(under_current: Identified, under_voltage: Identified) -> 
 def _with_winding(shaft: ShaftModel, winding: Fit | None) -> ShaftModel:
     """Return a shaft with the parameter of the fitted winding that it needs, unless it is known.
 
-    Under a current that is the back-EMF constant, which equals the torque constant but for losses;
-    under a voltage it is the resistance.
+    A shaft under a current needs the back-EMF constant, which equals the torque constant except for
+    losses. A shaft under a voltage needs the resistance.
     """
     parameters = shaft.known if winding is None else winding.model.all_values(winding.values)
-    name, source = OF_WINDING.get(shaft.driven_by, ("", ""))
+    name, source = WINDING_SOURCES.get(shaft.driven_by, ("", ""))
     value = parameters.get(source, 0.0)
     if name in (*shaft.known, *shaft.estimated) or not value > 0.0:
         return shaft
@@ -296,7 +298,7 @@ def check_arguments(
 ) -> dict[str, float]:
     """Validate the arguments of `identify`, and return the known parameters and gear ratio."""
     motor = base_motor(base)
-    # Without the ratio of its gear, a motor's parameters would be fitted at the output.
+    # Without the gear ratio, the fitted parameters of the motor would refer to the output.
     ratio = 1.0 if motor is None else motor.gear_ratio
     known = {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **(known or {})}
     _, moving, driven_by, output = assign_logs(logs)
@@ -310,7 +312,7 @@ def check_arguments(
         known, [name for name in PARAMETERS if name != "friction_torque"], "parameter", "known."
     )
     if rig is not None:
-        check_names([rig], OF_RIG, "rig")
+        check_names([rig], RIG_PARAMETERS, "rig")
     check_names([friction], ("auto", "coulomb", "stribeck", "load", "both"), "friction")
     for name, value in known.items():
         parameter = PARAMETERS[name]
@@ -353,9 +355,9 @@ def check_arguments(
 def predict_missing(
     logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, Any] | None
 ) -> str | None:
-    """Return which parameters of an actuator these logs cannot determine; None if there are none.
+    """Return a message on actuator parameters that these logs cannot determine, or None.
 
-    The signals of the logs decide, before any fit.
+    Only the signals of the logs are considered, so that no fit is needed.
     """
     electrical, moving, driven_by, _ = assign_logs(logs)
     names = {*known, *(("resistance", "inductance") if electrical else ())}

@@ -1,4 +1,4 @@
-"""Bench logs in SI units, properties of their sensors and motion, and segments of them."""
+"""Bench logs in SI units, estimates of sensor noise and motion, and cutting into segments."""
 
 import dataclasses
 import itertools
@@ -20,10 +20,12 @@ SIGNALS = {
     "command": None,  # setpoint of a controller, in any unit
 }
 """Signal of a log -> its SI unit; None: any."""
-GAP_STEPS = 5.0  # a longer step, in median steps, is a gap, across which nothing is simulated
+# Nothing is simulated across a gap.
+GAP_STEPS = 5.0
+"""Time step, in median steps, above which a step is a gap."""
 _ROUND_DIGITS = {*(tenths / 10 for tenths in range(10, 100)), 1.25, 2.25}
-"""Leading digits of a step that probably comes from the rounding of a file."""
-_MAX_LEVELS = 1_000_000  # levels of a converter; a signal with more counts as continuous
+"""Mantissas of a quantization step that probably comes from decimal rounding in a file."""
+_MAX_LEVELS = 1_000_000  # a signal with more levels of quantization counts as continuous
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Finding:
     check: str
     """Name of the check."""
     row: int | None
-    """Row of the file, the first one being 1, headers not counted; None: the whole log."""
+    """Number of the row in the file, from 1 and without headers; None: the whole log."""
     message: str
     """Description of the fault, with its size."""
     remedy: str
@@ -46,8 +48,8 @@ class Finding:
 class Log:
     """A bench log in SI units; times increase strictly, gaps and dropped rows are allowed.
 
-    Signals are those of the motor's output; positive voltage, current, torque and speed have the
-    same direction.
+    Position, velocity and torque are those of the motor's output. Positive voltage, current, torque
+    and speed have the same direction.
 
     Raises:
         ValueError: a signal is unknown, has another shape than the times or a value that is not
@@ -67,7 +69,7 @@ class Log:
     constants: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Numbers that the file states for the whole log, such as `kp` or `mass`."""
     rows: np.ndarray | None = None
-    """Row of the file for each row, shape (n,), the first being 1; None: all rows, in order."""
+    """Number in the file of each row, shape (n,), from 1; None: all rows, in order."""
     findings: tuple[Finding, ...] = ()
     """Findings from reading the file."""
 
@@ -116,7 +118,7 @@ class Log:
 
     @property
     def row_numbers(self) -> np.ndarray:
-        """Row of the file for each row, shape (n,), the first being 1."""
+        """Number in the file of each row, shape (n,), from 1."""
         return np.arange(1, len(self.time) + 1) if self.rows is None else self.rows
 
     @property
@@ -128,8 +130,8 @@ class Log:
 def gapless_stretches(log: Log) -> list[slice]:
     """Return the stretches of a log without gaps, each of at least two rows.
 
-    A simulation may run through a stretch by its time stamps. Its steps differ where single rows
-    were dropped.
+    The time steps within a stretch differ if single rows were dropped: a simulation must use the
+    time stamps.
     """
     gaps = np.flatnonzero(np.diff(log.time) > GAP_STEPS * log.step) + 1
     edges = [0, *map(int, gaps), len(log.time)]
@@ -148,7 +150,7 @@ def find_resolution(values: np.ndarray) -> float:
     # The file may round values, which makes equal steps slightly different: their mean is better.
     min_step = float(steps.min())
     min_step = float(steps[steps < 1.2 * min_step].mean())
-    # Neighboring levels may be missing, so that the smallest step may be two or three of the grid.
+    # Neighboring levels may be missing, so that the smallest step may be two or three grid steps.
     for parts in (1, 2, 3):
         count = round(parts * spread / min_step)
         grid = (levels - levels[0]) * (count / spread)
@@ -160,7 +162,7 @@ def find_resolution(values: np.ndarray) -> float:
 def find_turn_jumps(values: np.ndarray, period: float) -> np.ndarray:
     """Return the rows after which an angle jumps by a turn, which is `period` in its unit.
 
-    There are none if many of the steps are as large as a part of a turn: then the shaft is fast.
+    The result is empty if over a fifth of the steps exceed a quarter turn: then the shaft is fast.
     """
     steps = np.abs(np.diff(values))
     jumps = np.flatnonzero(np.abs(steps - period) < 0.1 * period)
@@ -306,11 +308,12 @@ SEGMENT_DURATION = 0.5
 # Residuals within a block are correlated: resampling single rows would make intervals too narrow.
 BLOCK_DURATION = 1.0
 """Shortest stretch [s] of a log that is resampled as a whole."""
-# The shaft is slower than the winding. Combined rows have their mean input and first position.
+# The shaft is slower than the winding. Combined rows have the mean of their inputs and the position
+# of the first row.
 SHAFT_STEP = 5e-4
 """Shortest time step [s] of a shaft's segments; rows that are closer are combined."""
 SPIKE_FACTOR = 50.0
-"""Deviation of a spike from its neighbors, over the 90th percentile of all rows."""
+"""Smallest deviation of a spike from its neighbors, over the 90th percentile of all rows."""
 # The window is short compared with the motion of a shaft, and long compared with the steps of an
 # encoder.
 SMOOTHING_WINDOW = 4e-3
@@ -356,7 +359,7 @@ def replace_signal(log: Log, name: str, values: np.ndarray) -> Log:
 
 
 def remove_spikes(values: np.ndarray) -> np.ndarray:
-    """Return a signal whose spikes of single rows are replaced by the nearer neighbor.
+    """Return a signal in which each spike of a single row is replaced by its nearer neighbor.
 
     The robust loss tolerates outliers of an output, but the input of a simulation must not have
     any.
@@ -373,8 +376,8 @@ def remove_spikes(values: np.ndarray) -> np.ndarray:
 def sensor_deviation(log: Log, name: str) -> float:
     """Return the standard deviation of a signal's sensor, from its noise or its quantization.
 
-    The noise is the part that no smooth motion has within four rows. If it is less than a step of
-    the quantization, only the quantization counts.
+    Third differences over four rows, which a smooth motion hardly affects, estimate the noise. If
+    it is less than a step of the quantization, only the quantization counts.
     """
     values = log.signals[name]
     step = log.resolution.get(name, 0.0)
@@ -415,8 +418,8 @@ def smoothed_speeds(
 ) -> np.ndarray:
     """Return the slopes [rad/s] of lines fitted to the positions in a window around each center.
 
-    A window has at least three positions, and is cut off at the ends of the log. In its middle the
-    slope of the line is also that of a fitted parabola.
+    A window has at least three positions, and is cut off at the ends of the log. At the middle of a
+    window, the slope of the line equals that of a fitted parabola.
     """
     count = len(times)
     first = np.searchsorted(times, centers - 0.5 * window - 1e-9)
@@ -426,14 +429,14 @@ def smoothed_speeds(
     last = np.clip(np.maximum(last, nearest + 1), first + 2, count)
     # Differences of cumulative sums give the sums of all windows at once. Offsets from the first
     # row keep the sums small, and their differences accurate.
-    offsets, turns = times - times[0], positions - positions[0]
+    elapsed, angles = times - times[0], positions - positions[0]
     cumulative = [
         np.concatenate([[0.0], np.cumsum(values)])
-        for values in (offsets, turns, offsets * turns, offsets**2)
+        for values in (elapsed, angles, elapsed * angles, elapsed**2)
     ]
     t, q, tq, tt = (values[last] - values[first] for values in cumulative)
-    number = last - first
-    return (number * tq - t * q) / (number * tt - t * t)
+    num_rows = last - first
+    return (num_rows * tq - t * q) / (num_rows * tt - t * t)
 
 
 def cut_segments(log: Log, duration: float) -> list[slice]:
@@ -473,7 +476,7 @@ def initial_state(log: Log, rows: slice) -> np.ndarray:
 
 def halve_rate(log: Log) -> Log:
     """Return every second row of a log; a mean voltage becomes the mean over both rows."""
-    # An odd number of rows begins and ends with a row that stays.
+    # With an odd number of rows, both the first and the last row remain.
     count = len(log.time) - (len(log.time) + 1) % 2
     half = log.slice_rows(slice(0, count, 2))
     if not (log.mean_voltage and log.has("voltage")):

@@ -24,12 +24,18 @@ from codrl_mj.identify.log import (
     shift_signal,
     smoothed_speeds,
 )
-from codrl_mj.identify.parameters import ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
+from codrl_mj.identify.parameters import (
+    ELECTRICAL,
+    FRICTION,
+    FRICTION_PARAMETERS,
+    PARAMETERS,
+    RIG_PARAMETERS,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class WindingModel(Model):
-    """The winding: L di/dt = u - R i - kE n w, exact at a constant voltage and the mean speed."""
+    """Winding, L di/dt = u - R i - kE n w, solved exactly for held voltages and mean speeds."""
 
     driven_by: str = "voltage"
     output: str = "current"
@@ -58,7 +64,7 @@ class WindingModel(Model):
     def segments(
         self, logs: Sequence[Log], speeds: Sequence[np.ndarray] | None = None
     ) -> list[Segment]:
-        """Cut logs into segments of a block each; `speeds` [rad/s] replace those of the logs."""
+        """Cut logs into segments of one block each; `speeds` [rad/s] replace those of the logs."""
         segments: list[Segment] = []
         for index, log in enumerate(logs):
             volts, deviation = log.signals["voltage"], sensor_deviation(log, "current")
@@ -75,7 +81,7 @@ class WindingModel(Model):
         """Return the model with its free parameters, and guesses from regressions.
 
         The integral of the voltage over a window is R times the integral of the current, plus L
-        times its change, plus kE times the angle turned. Each guess has another length of window.
+        times its change, plus kE times the angle turned. Each guess uses another length of window.
         """
         moving = any(np.any(segment.speeds) for segment in segments)
         free = tuple(
@@ -105,7 +111,7 @@ class WindingModel(Model):
         magnitudes = np.abs(np.median(starts, axis=0))
         volts = np.concatenate([segment.inputs for segment in segments])
         amperes = np.concatenate([segment.measured for segment in segments])
-        # A regression may give values near 0 or below: rough magnitudes replace them.
+        # Values of a regression that are near 0 or negative are replaced by rough magnitudes.
         fallback = {
             "resistance": np.std(volts) / max(np.std(amperes), 1e-9) + 1e-6,
             "inductance": 1e-4,
@@ -119,8 +125,8 @@ class WindingModel(Model):
     def _mean_speeds(self, log: Log) -> np.ndarray:
         """Return the mean speeds until the next row, shape (n,), 0 if locked.
 
-        They are those of smoothed positions. With a fitted shaft they are those of its simulation,
-        plus those of the smoothed residuals.
+        They are the slopes of smoothed positions. With a fitted shaft they are the speeds of its
+        simulation plus the slopes of the smoothed residuals.
         """
         speeds, shaft = np.zeros(len(log.time)), self.shaft
         for rows in gapless_stretches(log) if has_motion(log) else ():
@@ -153,7 +159,7 @@ def _regress_free(
     free: Sequence[str],
     fixed: Mapping[str, float],
 ) -> np.ndarray:
-    """Return the factors of the free columns by least squares, with the other factors fixed."""
+    """Return the least-squares coefficients of the free columns, with the others fixed."""
     remainder = target - sum(
         columns[:, index] * fixed[name] for index, name in enumerate(names) if name not in free
     )
@@ -166,9 +172,9 @@ def _regress_free(
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class ShaftModel(Model):
-    """The shaft: inertia, gravity, load and friction under a torque, a current or a voltage.
+    """Shaft with inertia, gravity, load and friction, driven by a torque, a current or a voltage.
 
-    Under a voltage the current is quasi-static, and kE equals kT unless it is known.
+    If it is driven by a voltage, the current is quasi-static, and kE equals kT unless it is known.
     """
 
     rig: str
@@ -211,8 +217,8 @@ class ShaftModel(Model):
         driven_by, output, block = self.driven_by, self.output, -1
         for index, log in enumerate(logs):
             inputs = log.signals[driven_by]
-            # A voltage may have peaks of one row, as a PRBS with a fast clock; a sensor's peaks are
-            # outliers.
+            # Single-row peaks of a voltage may be real, for example in a PRBS with a fast clock;
+            # those of a sensor are outliers.
             if driven_by != "voltage":
                 inputs = remove_spikes(inputs)
             measured, deviation = log.signals[output], sensor_deviation(log, output)
@@ -255,9 +261,9 @@ class ShaftModel(Model):
         return segments
 
     def initial_guess(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
-        """Return the model with its free parameters, and guesses from regressions and near them."""
+        """Return the model with its free parameters, and guesses by regressions and around them."""
         driven_by, known = self.driven_by, self.known
-        names = [*OF_RIG[self.rig], *OF_FRICTION[self.friction], *self.estimated]
+        names = [*RIG_PARAMETERS[self.rig], *FRICTION_PARAMETERS[self.friction], *self.estimated]
         if driven_by != "torque":
             names.insert(0, "torque_constant")
         if driven_by == "voltage":
@@ -296,10 +302,10 @@ def _shaft_start(
     fixed: Mapping[str, float],
     known: Mapping[str, float],
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return guesses of all parameters of a shaft, and smallest scales of some.
+    """Return guesses of all parameters of a shaft, and lower limits for the scales of some.
 
     Args:
-        factors: of the regression of the input.
+        factors: coefficients of the regression of the input.
         drive: root mean square of the input.
         speed: root mean square of the speed [rad/s].
         driven_by: `torque`, `current` or `voltage`.
@@ -329,7 +335,7 @@ def _shaft_start(
         gain = per_volt
     else:
         start["torque_constant"] = gain / ratio
-    # Without an input, as in a free swing, gravity or a known load gives the size of torques.
+    # Without an input, as in a free swing, gravity or a known load sets the scale of the torques.
     load = max(known.get("mgl", 0.0), abs(known.get("constant_torque", 0.0)))
     torque = max(drive * gain if drive * gain > 1e-3 * load else load, 1e-9)
     start |= {
@@ -370,13 +376,13 @@ def _shaft_regression(
     """Regress the integral of the input on the integrals of the shaft's torques.
 
     Args:
-        segments: of the shaft's logs.
+        segments: segments of the shaft's logs.
         rig: `pendulum`, `free` or `load`.
         output: `position` or `velocity`.
         window: duration [s] that positions are smoothed over.
 
     Returns:
-        The factors, and the root mean squares of the input and of the speed [rad/s].
+        The coefficients, and the root mean squares of the input and of the speed [rad/s].
     """
     from scipy.integrate import cumulative_trapezoid
 
@@ -404,7 +410,7 @@ def _shaft_regression(
             segment.inputs,
         )
         integrals = [integrate(column, times) for column in columns]
-        # Windows of 2.5 smoothing windows make the errors of the smoothed speeds unimportant.
+        # Over 2.5 smoothing windows the errors of the smoothed speeds are small against the change.
         edges = np.searchsorted(times, np.arange(times[0], times[-1] + 1e-9, 2.5 * window))
         edges = np.unique(np.minimum(edges, len(times) - 1))
         rows.append(
@@ -417,7 +423,11 @@ def _shaft_regression(
         all_speeds.append(speed)
     table = np.concatenate(rows)
     names = ["inertia", "mgl", "constant_torque", "coulomb", "viscous"]
-    free = [name for name in names if name not in ("mgl", "constant_torque") or name in OF_RIG[rig]]
+    free = [
+        name
+        for name in names
+        if name not in ("mgl", "constant_torque") or name in RIG_PARAMETERS[rig]
+    ]
     solution = _regress_free(table[:, :5], table[:, 5], names, free, dict.fromkeys(names, 0.0))
     factors = dict.fromkeys(names, 0.0) | dict(zip(free, map(float, solution), strict=True))
     size = float(np.sqrt(np.mean(np.concatenate(inputs) ** 2)))

@@ -43,7 +43,7 @@ PARAMETERS = {
     "load_inertia": Parameter("kg*m^2", 0.0, 1e4, "inertia at the output without the motor's"),
     "gear_ratio": Parameter("", 1e-3, 1e5, "turns of the rotor per turn of the output", 1.0),
 }
-"""All parameters; all but `friction_torque`, which is a sum, can be given as known."""
+"""All parameters; each can be given as known, except `friction_torque`, which is a sum."""
 ELECTRICAL = ("resistance", "inductance", "back_emf_constant")
 FRICTION = (
     "coulomb_friction",
@@ -56,7 +56,7 @@ FRICTION = (
 
 Their intervals are judged by their share of the torque, because a relative error has no meaning.
 """
-OF_MOTOR = (
+MOTOR_PARAMETERS = (
     *(
         "resistance",
         "inductance",
@@ -74,14 +74,14 @@ OF_MOTOR = (
     ),
 )
 """Fields of `GearMotor` that are identified or known."""
-OF_LOSS = ("gear_efficiency", "stribeck_friction", "stribeck_speed", "stribeck_exponent")
+LOSS_PARAMETERS = ("gear_efficiency", "stribeck_friction", "stribeck_speed", "stribeck_exponent")
 """Fields of `GearMotor` that a shaft takes from a base if they are neither fitted nor known."""
-OF_WINDING = {
+WINDING_SOURCES = {
     "current": ("torque_constant", "back_emf_constant"),
     "voltage": ("resistance", "resistance"),
 }
 """Signal that drives a shaft -> parameter taken from the winding, and its name there."""
-OF_FRICTION: dict[str, tuple[str, ...]] = {
+FRICTION_PARAMETERS: dict[str, tuple[str, ...]] = {
     "coulomb": ("coulomb_friction", "viscous_friction"),
     "stribeck": ("coulomb_friction", "viscous_friction", "stribeck_friction", "stribeck_speed"),
     "load": ("coulomb_friction", "viscous_friction", "gear_efficiency"),
@@ -93,7 +93,7 @@ OF_FRICTION: dict[str, tuple[str, ...]] = {
         "gear_efficiency",
     ),
 }
-OF_RIG: dict[str, tuple[str, ...]] = {
+RIG_PARAMETERS: dict[str, tuple[str, ...]] = {
     "pendulum": ("inertia", "mgl"),
     "free": ("inertia",),
     "load": ("inertia", "constant_torque"),
@@ -106,7 +106,12 @@ DEFAULTS = {
 """Values of parameters that are neither fitted nor known."""
 ESTIMABLE = {
     **dict.fromkeys(
-        [*OF_RIG["pendulum"], *OF_RIG["load"], *OF_FRICTION["both"], "torque_constant"]
+        [
+            *RIG_PARAMETERS["pendulum"],
+            *RIG_PARAMETERS["load"],
+            *FRICTION_PARAMETERS["both"],
+            "torque_constant",
+        ]
     ),
     "torque_gain": "torque",
     "back_emf_constant": "voltage",

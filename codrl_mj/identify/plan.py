@@ -1,10 +1,11 @@
 """Choice of the excitation, sample rate and amplitude for a motor, before a measurement.
 
-The expected errors come from a fit to a simulated log without noise, at the true parameters: from
-the expected noise and the Jacobian of the fit (Fisher information), and for a winding also from a
-voltage that is taken as held although it changes between rows. Winding and shaft are fitted
-separately: the current under voltage and speed, the position under the measured current. Source:
-Ljung, *System Identification* (2nd ed. 1999), sec. 7.4 and 13.2.
+The expected errors are computed at the true parameters, from a simulated log without noise. They
+follow from the expected noise and the Jacobian of the fit (Fisher information). For a winding they
+include the bias from a voltage that changes between rows, but is modeled as held. Winding and shaft
+are fitted separately: the winding to the current, driven by voltage and speed, and the shaft to the
+position, driven by the measured current. Source: Ljung, *System Identification* (2nd ed. 1999),
+sec. 7.4 and 13.2.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ from codrl_mj.fields import Checked, choice, real
 from codrl_mj.identify.estimate import Model, optimize
 from codrl_mj.identify.log import Log, Segment
 from codrl_mj.identify.models import ShaftModel, WindingModel
-from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, OF_LOSS, PARAMETERS
+from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, LOSS_PARAMETERS, PARAMETERS
 from codrl_mj.identify.synthetic import (
     EXCITATIONS,
     FREE,
@@ -49,7 +50,7 @@ MARGIN = 3.0
 RATES = (1e3, 2e3, 5e3, 10e3, 20e3)
 """Sample rates [Hz] that are compared."""
 _SEGMENT = 0.25  # duration of a segment [s]
-_PHASE = 0.37  # time between a row and the excitation's clock, over the time of a row
+_PHASE = 0.37  # offset of the excitation's clock from the rows, in row periods
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,8 +64,9 @@ class Sensing(Checked):
     voltage: Literal["together", "instantaneous", "mean"] = choice(
         "together", "together", "instantaneous", "mean"
     )
-    """Voltage of a row. With `together` the voltage changes only when a row is written; else it
-    has a separate clock, and a row has its `instantaneous` value, or its `mean` until the next row.
+    """Timing of the logged voltage. With `together` the voltage changes only when a row is written.
+    Otherwise it has a separate clock, and a row has its `instantaneous` value, or its `mean` until
+    the next row.
     """
 
 
@@ -108,12 +110,12 @@ def plan(
     """Compare excitations and sample rates for a motor whose parameters are roughly known.
 
     Args:
-        drive: with the motor, the supply and the current limit.
-        load: at the output.
+        drive: drive with the motor, the supply and the current limit.
+        load: load at the output.
         sensing: accuracy of the sensors; None takes the defaults.
-        duration: of a log [s].
+        duration: duration of a log [s].
         max_current: largest current of the bench [A]; the drive's limit applies, too.
-        continuous_current: largest root mean square of the current [A], of the motor.
+        continuous_current: largest root mean square of the motor's current [A].
     """
     if not duration >= 4.0 * _SEGMENT:
         raise ValueError(
@@ -156,7 +158,7 @@ def plan(
 
 def write_excitation(path: Path, option: Option) -> None:
     """Write an option's voltage as CSV at its rate, with columns `time` [s] and `voltage` [V]."""
-    # The small offset keeps a sample that is due at a change of the voltage from falling before it.
+    # With the small offset, a sample at the instant of a voltage change has the new voltage.
     time = np.arange(round(option.excitation.duration * option.rate) + 1) / option.rate
     table = np.column_stack([time, option.excitation.voltage(time + 1e-9 / option.rate)])
     with atomic_write(path) as temporary:
@@ -181,7 +183,7 @@ def _option(
         duration,
         frequency=2.0 if kind == "square" else 0.5,
         highest=min(200.0, 0.5 / constant),
-        # An even number of rows per change lets a fit of every second row have the right voltage.
+        # With an even number of rows per change, every second row still sees all changes.
         clock=2 * max(round(2.0 * constant * rate), 1) / rate if together else 4.0 * constant,
     )
     locked_load = dataclasses.replace(load, locked=load.locked or excitation.locked)
@@ -215,8 +217,9 @@ def _expected_errors(
 ) -> dict[str, float]:
     """Return the expected relative errors of a winding and a shaft.
 
-    The winding is fitted to the current at the true speed, the shaft to the position. The torque is
-    known as well as the back-EMF constant. Parameters that are 0 on the datasheet are left out.
+    The winding is fitted to the current at the true speed, the shaft to the position. The torque
+    constant is assumed to have the same relative error as the back-EMF constant. Parameters that
+    are 0 on the datasheet are left out.
     """
     deviation = sensing.current_noise * float(np.abs(log.signals["current"]).max())
     speed = np.append(np.diff(log.signals["position"]) / np.diff(log.time), 0.0)
@@ -231,7 +234,7 @@ def _expected_errors(
     }
     known |= {"mgl": load.gravity, "constant_torque": load.against}
     known = {name: value for name, value in known.items() if name not in GOALS or value == 0.0}
-    losses = {name: truth[name] for name in OF_LOSS}
+    losses = {name: truth[name] for name in LOSS_PARAMETERS}
     shaft = ShaftModel(
         rig="free",
         friction="coulomb",
@@ -251,13 +254,13 @@ def _expected_errors(
 def _fit_errors(
     truth: Mapping[str, float], model: Model, segments: Sequence[Segment], deviation: float
 ) -> dict[str, float]:
-    """Return the relative errors of a fit due to noise, and of a winding also due to its residuals.
+    """Return the relative errors of a fit from noise and, for a winding, from its residuals.
 
     Errors above 1 are left out.
     """
     model, _ = model.initial_guess(segments)
     values = np.array([truth[name] for name in model.names])
-    # No evaluation: the residuals and the Jacobian at the true values are all that is needed.
+    # With 0 evaluations `optimize` computes only the residuals and the Jacobian at the true values.
     fit = optimize(
         model, [segment._replace(deviation=deviation) for segment in segments], values, 0
     )

@@ -35,13 +35,15 @@ _NAMES = {
     "current": "i current iq strom",
     "voltage": "u v voltage volts spannung vq uq",
 }
-"""Signal -> words in its columns' names.
+"""Signal -> words in the names of its columns.
 
-If a name has words of several signals, the first signal counts. Single letters count only if there
-is no other word.
+If a name has words of several signals, the first signal counts. Single letters count only if no
+longer word matches.
 """
 _READINGS = {"present", "feedback", "measured", "actual", "state"}
-"""Words in the name of a measured signal; its unit tells which signal, or else it is a position."""
+"""Words in the name of a measured signal. Its unit decides which one; without a unit it is a
+position.
+"""
 # The letter d marks signals of the d axis.
 _NO_SIGNALS = {"error", "err", "limit", "max", "mode", "status", "fault", "gain", "integrator", "d"}
 """Words in the name of a column that no fit uses."""
@@ -151,7 +153,7 @@ def _signal(name: str, table: Table, used: Collection[str]) -> tuple[str | None,
     Signal and unit are None if they are unknown.
     """
     stated, bare = _stated_units(name, table)
-    # Words of iMotor and i_motor are the same, but a unit such as mA must not be split.
+    # iMotor is split into words like i_motor, but a unit such as mA must not be split.
     words = [
         word
         for word in re.split(r"[\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", bare).lower())
@@ -209,9 +211,10 @@ def _signal(name: str, table: Table, used: Collection[str]) -> tuple[str | None,
 
 
 def _stated_units(name: str, table: Table) -> tuple[list[str], str]:
-    """Return the unit texts that the file states for a column, and the column's name without them.
+    """Return the units that the file states for a column, as texts, and the name without them.
 
-    A unit stands beside the name, in brackets, after "in", or as a sign at the end.
+    The unit is in a separate line of the file, or in the name: in brackets, after "in", or as a
+    sign at its end.
     """
     bracket = re.search(r"[\[(]\s*([^\])]*)\s*[\])]", name)
     bare = (name.replace(bracket[0], " ") if bracket else name).strip()
@@ -277,7 +280,7 @@ def _valid_unit(signal: str, unit: str) -> str | None:
 def _entry(signal: str, name: str, unit: str | None, table: Table) -> tuple[_Entry, str]:
     """Return the mapping of a signal, and a doubt about it if its unit is not stated."""
     bare = re.sub(r"\[0\]$", "", name)
-    # Other names are quoted in a formula.
+    # In a formula, names that are not identifiers are quoted.
     is_identifier = bare.isascii() and bare.isidentifier() and not keyword.iskeyword(bare)
     formula = name if is_identifier else json.dumps(name, ensure_ascii=False)
     values, doubt = _finite_values(name, table), ""
@@ -365,9 +368,9 @@ def _time_units(values: np.ndarray) -> list[str]:
 
 
 def _add_voltage(entries: dict[str, _Entry], table: Table) -> list[str]:
-    """Map a voltage to the supply if it hardly changes, compute the motor's, and return doubts.
+    """Map an almost constant voltage to the supply, derive the motor's voltage, and return doubts.
 
-    With a duty the motor's voltage is its share of the supply's voltage.
+    With a duty, the motor's voltage is the duty times the voltage of the supply.
     """
     doubts = []
     if "voltage" in entries and "bus" not in entries:
@@ -377,7 +380,8 @@ def _add_voltage(entries: dict[str, _Entry], table: Table) -> list[str]:
             for signal in ("current", "torque", "velocity")
             if signal in entries
         ]
-        # A duty counts as a motor that reverses.
+        # A logged duty varies the motor's voltage: then an almost constant voltage is that of the
+        # supply, even if no other signal shows that the motor reverses.
         if is_supply_voltage(
             values, [*responses, np.array([-1.0, 1.0])] if "duty" in entries else responses
         ):
@@ -391,7 +395,7 @@ def _add_voltage(entries: dict[str, _Entry], table: Table) -> list[str]:
         duty, bus = entries["duty"], entries["bus"]
         percent = "/100" if duty.unit == "percent" else ""
         entries["voltage"] = _Entry(bus.column, f"{duty.formula}{percent}*{bus.formula}", bus.unit)
-        doubts.append("voltage: taken as the duty's share of the bus")
+        doubts.append("voltage: computed as the duty times the bus voltage")
     return doubts
 
 
@@ -412,7 +416,7 @@ def _problem(name: str, table: Table, entries: dict[str, _Entry]) -> str | None:
     except ValueError as error:
         return str(error)
     obstacle = find_obstacle([log])
-    # With an open unit of time the rows may be frequent enough.
+    # As long as the unit of time is open, the rows may turn out to be frequent enough.
     if obstacle is None or (obstacle.check == "rows" and entries["time"].unit == OPEN_UNIT):
         return None
     return f"{obstacle.message}; {obstacle.remedy}"

@@ -43,7 +43,7 @@ class Table(NamedTuple):
     ragged: list[int]  # numbers of incomplete rows, from 1
     lines: Sequence[int] = ()  # line of the file for each row
     units: Mapping[str, str] = {}  # column -> unit, if a line states the units
-    decimal_commas: bool = False  # whether numbers may have a decimal comma
+    decimal_commas: bool = False  # True if numbers may have a decimal comma
     # Column that held lists -> names of their entries, such as joints.
     entries: Mapping[str, list[str]] = {}
 
@@ -92,14 +92,14 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
     log starts at 0.
 
     Args:
-        path: .csv, .txt, .dat, .tsv, .json, any of them .gz, or .parquet. CSV has a line of names,
-            and a comma, semicolon, tab or blanks between values; lines that begin with # or hold
-            one cell are no rows, one without a number under the names is of units. Decimal commas,
-            times of day (ISO 8601) and Latin-1 are read. JSON is a list of rows, or an object with
-            one such list, such as `entries`, and numbers beside it, which formulas can use, or an
-            object of columns. In a column of lists, `column[0]` is the first entry, and
-            `column[elbow]` is the entry of that name, by `features` in the file or in
-            meta/info.json of the data set that contains the file.
+        path: .csv, .txt, .dat, .tsv or .json, each also compressed as .gz, or .parquet. CSV has a
+            line of column names, and commas, semicolons, tabs or blanks between values. Lines that
+            begin with # or have only one cell are skipped. A line without numbers below the names
+            states the units. Decimal commas, times of day (ISO 8601) and Latin-1 are accepted.
+            JSON is a list of rows; or an object with one such list, such as `entries`, and numbers,
+            which formulas can use; or an object of columns. If the cells of a column are lists,
+            `column[0]` is the first entry, and `column[elbow]` the entry with that name, according
+            to `features` in the file or in meta/info.json of the data set that contains the file.
         columns: `signal=formula:unit` separated by commas, or a mapping of signals to
             `formula:unit`. A voltage is held until the next row, or `mean(formula)` is its mean
             until the next row. `only=formula` leaves out the rows where it is 0.
@@ -149,7 +149,7 @@ def table_to_log(name: str, table: Table, mapping: Mapping[str, Column]) -> Log:
         *_left_out(
             row_numbers[rows[~forward]],
             "stamps",
-            "have a time that is not after the rows before, and are left out",
+            "have a time that is not later than in all rows before, and are left out",
         ),
         *(
             Finding(
@@ -170,8 +170,8 @@ def table_to_log(name: str, table: Table, mapping: Mapping[str, Column]) -> Log:
     rows = rows[forward]
     if rows.size < 2 or unusable > _MAX_UNUSABLE * max(int(selected.sum()), 1):
         raise ValueError(
-            f"{rows.size} of {int(selected.sum())} rows can be used, must be 2 or more, and"
-            f" {1.0 - _MAX_UNUSABLE:.0%}: "
+            f"{rows.size} of {int(selected.sum())} rows can be used, must be at least 2"
+            f" and {1.0 - _MAX_UNUSABLE:.0%} of all: "
             + (
                 "; ".join(finding.message for finding in findings if finding.severity != "info")
                 or "there are no more"
@@ -196,7 +196,7 @@ def table_to_log(name: str, table: Table, mapping: Mapping[str, Column]) -> Log:
 def _find_unsigned(
     values: Mapping[str, Any], mapping: Mapping[str, Column], row_numbers: np.ndarray
 ) -> Iterator[Finding]:
-    """Find columns that look like registers whose sign was read as part of the number."""
+    """Find columns that look like signed registers which were read as unsigned numbers."""
     unconverted = (
         column
         for column in mapping.values()
@@ -220,8 +220,8 @@ def _find_unsigned(
             if high.any() and low.any() and np.all(plausible | np.isnan(numbers)):
                 row = int(row_numbers[np.flatnonzero(high)[0]])
                 text = (
-                    f"{name} is below {range_size / 4:.0f} or above {3 * range_size / 4:.0f}: does"
-                    f" it have {bits} bits and a sign?"
+                    f"{name} is below {range_size / 4:.0f} or above {3 * range_size / 4:.0f}: is it"
+                    f" a signed number of {bits} bits?"
                 )
                 yield Finding(
                     "error", "register", row, text, f"write twos_complement({name}, {bits})"
@@ -348,15 +348,15 @@ def _read_table(path: Path) -> Table:
 
 
 def _csv(text: str) -> Table:
-    """Parse a CSV table, also one below comments or other text.
+    """Parse a CSV table, even if comments or other text precede it.
 
     The columns' names are in the last line before the numbers, or above a line of units.
     """
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     bare = [(number, line) for number, line in lines if not line.startswith("#")]
     last = [line for _, line in bare[-20:]]
-    # A separator is in most of the last lines; of several, the first line that has one decides,
-    # which is the line of names and not a note.
+    # A separator occurs in most of the last lines. If several do, the first line that has any of
+    # them decides: it is the line of names, because notes above it seldom have one.
     usual = [mark for mark in ";\t," if 2 * sum(mark in line for line in last) > len(last)]
     separator = next((mark for _, line in bare for mark in usual if mark in line), " ")
     cells = []
@@ -370,7 +370,7 @@ def _csv(text: str) -> Table:
                 )
             )
         except csv.Error as error:
-            raise ValueError(f"line {number} is no row of cells: {error}") from None
+            raise ValueError(f"line {number} is not a row of cells: {error}") from None
         cells.append((number, [cell.strip() for cell in row]))
     common = (
         collections.Counter(len(row) for _, row in cells[-20:]).most_common(1)[0][0] if cells else 0
@@ -380,7 +380,7 @@ def _csv(text: str) -> Table:
     )
     first = next(filled, len(cells))
     above = [row for _, row in cells[:first] if len(row) > 1 or separator == " "]
-    # numpy writes the names behind a #.
+    # numpy writes the line of names as a comment, after a #.
     if first == 0 or not above:
         comments = [line.lstrip("# ") for _, line in lines if line.startswith("#")]
         above = [

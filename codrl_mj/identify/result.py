@@ -10,18 +10,19 @@ import numpy as np
 
 from codrl_mj.identify.estimate import Fit, best_initial_state
 from codrl_mj.identify.log import Log, Segment, gapless_stretches, initial_state
-from codrl_mj.identify.parameters import DEFAULTS, OF_MOTOR, PARAMETERS
+from codrl_mj.identify.parameters import DEFAULTS, MOTOR_PARAMETERS, PARAMETERS
 from codrl_mj.runs.files import atomic_write, write_json
 
 Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "refused"]
 ACTUATOR = "actuator.yaml"  # name of the file in a folder of results
-# Beyond this share the columns or the model are wrong, and no parameter means anything.
+# Above this share the columns or the model are wrong, and the parameters are meaningless.
 MAX_UNEXPLAINED = 0.2
 """Largest unexplained share of the motion with which parameters are usable."""
 USABLE = ("identified", "rough", "given")
+"""Status of parameters from which an actuator can be made."""
 HORIZON = 0.5  # duration [s] of a prediction
 START_DURATION = 0.03
-"""Time [s] at the start of a prediction, or five rows, that its initial state is fitted to."""
+"""Duration [s], or five rows if longer, at the start of a prediction that fit its initial state."""
 
 
 def base_motor(base: Mapping[str, Any] | None) -> Any:
@@ -33,7 +34,7 @@ def base_motor(base: Mapping[str, Any] | None) -> Any:
 
 
 def missing_parameters(names: Collection[str], base: Mapping[str, Any] | None) -> str | None:
-    """Return which parameters of a motor are neither in `names` nor in a base, with a remedy."""
+    """Return a message on parameters that are neither in `names` nor in a base, or None."""
     motor = base_motor(base)
     if (
         motor is not None
@@ -76,7 +77,7 @@ class Estimate:
     high: float
     status: Status
     why: str = ""
-    """Reason of the status."""
+    """Reason for the status."""
     causes: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Half-widths of the interval by cause."""
 
@@ -87,7 +88,7 @@ class Estimate:
 
 
 class Trace(NamedTuple):
-    """A simulation and a measurement, in segments with separate initial states."""
+    """Measured and simulated output of a log, in segments with separate initial states."""
 
     log: str
     part: str  # `winding` or `shaft`
@@ -118,15 +119,15 @@ class Prediction:
     output: str
     """Predicted signal, `position` [rad] or `velocity` [rad/s]."""
     open_loop: float
-    """Error over `HORIZON` under the logged input, from states fitted to `START_DURATION`."""
+    """Error of predictions over `HORIZON` with the logged input, after `START_DURATION`."""
     closed_loop: float | None
-    """Error over the whole log under the servo's proportional law; None without such a law."""
+    """Error over the whole log with a proportional controller; None if none fits the input."""
     trace: Trace | None = dataclasses.field(default=None, compare=False, repr=False)
     """Simulation of `open_loop`; not written to files."""
 
 
 def predict(fit: Fit, log: Log) -> Prediction:
-    """Simulate a log with a fitted shaft, and return the errors."""
+    """Simulate a log with a fitted shaft, and return the prediction errors."""
     model, simulate, errors, simulated = fit.model, fit.model.simulator(fit.values), [], []
     segments = dataclasses.replace(model, segment=HORIZON).segments([log])
     for segment in segments:
@@ -146,12 +147,12 @@ def predict(fit: Fit, log: Log) -> Prediction:
 def closed_loop_error(fit: Fit, log: Log) -> float | None:
     """Return the mean absolute error [rad] over a whole log under its command.
 
-    The input follows from the command by a proportional law, a line through the origin that is
-    fitted to the control error and the input where the input is not at its limit. The limit is the
-    `bus` of a voltage, or the largest input of the log.
+    The servo is modeled as a proportional controller. Its gain is fitted to the control error and
+    the input, where the input is not at its limit. The limit of a voltage is the `bus`, if it was
+    logged; otherwise it is the largest input of the log.
 
     Returns:
-        None if the log has no command, or if no such law explains the input.
+        None if the log has no command, or if no proportional controller explains the input.
     """
     from codrl_mj.identify.simulation import simulate_servo
 
@@ -188,7 +189,7 @@ def closed_loop_error(fit: Fit, log: Log) -> float | None:
 
 
 def fitted_traces(part: str, fit: Fit) -> Iterator[Trace]:
-    """Return the fit of `winding` or `shaft` to each of its logs."""
+    """Yield the trace of a fitted `winding` or `shaft` for each of its logs."""
     for index, log in enumerate(fit.logs):
         pairs = zip(fit.segments, fit.residuals, strict=True)
         simulated = [
@@ -202,11 +203,7 @@ def fitted_traces(part: str, fit: Fit) -> Iterator[Trace]:
 
 @dataclasses.dataclass(frozen=True)
 class Identified:
-    """A motor that was identified from logs.
-
-    Raises:
-        ValueError: by `actuator`, if a parameter was not identified.
-    """
+    """A motor that was identified from logs."""
 
     logs: tuple[str, ...]
     """Names of the logs."""
@@ -223,9 +220,9 @@ class Identified:
     """Errors on the logs held out."""
     warnings: tuple[str, ...]
     base: Mapping[str, Any] | None = None
-    """Mapping of a drive, for parameters that the logs do not determine; None: none."""
+    """Mapping of a drive, which supplies parameters that the logs do not determine, or None."""
     traces: tuple[Trace, ...] = ()
-    """Winding and shaft with the fitted logs; not written to files."""
+    """Traces of winding and shaft for the fitted logs; not written to files."""
     correlations: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(
         default_factory=dict
     )
@@ -255,7 +252,7 @@ class Identified:
         unusable = [
             estimate
             for estimate in self.estimates
-            if estimate.name in OF_MOTOR and estimate.status not in USABLE
+            if estimate.name in MOTOR_PARAMETERS and estimate.status not in USABLE
         ]
         names_by_reason: dict[str, list[str]] = {}
         for estimate in unusable:
@@ -284,10 +281,10 @@ class Identified:
             "assumed: set supply.voltage in actuator.yaml",
         )
         if self.base is not None:
-            source = "the motor's, by --motor"
+            source = "of the motor (--motor)"
         elif self.supply is not None:
             source = (
-                "the largest of the logs; no current limit: set controller.max_current in"
+                "largest voltage of the logs; no current limit: set controller.max_current in"
                 f" {ACTUATOR}"
             )
         return f"supply {volts:.4g} V: {source}"
@@ -301,11 +298,11 @@ class Identified:
         identified = {*DEFAULTS, *(estimate.name for estimate in self.estimates)}
         parameters = [
             f"{name} = {getattr(motor, name):.4g} {PARAMETERS[name].unit}"
-            for name in OF_MOTOR
+            for name in MOTOR_PARAMETERS
             if name not in identified
         ]
         return (
-            "not from these logs but the motor's, by --motor:"
+            "not from these logs, but from the motor (--motor):"
             f" {', '.join(map(str.strip, parameters))}"
             if parameters
             else None
@@ -316,7 +313,7 @@ class Identified:
         return {
             f"motor.{estimate.name}": (estimate.low, estimate.high)
             for estimate in self.estimates
-            if estimate.name in OF_MOTOR
+            if estimate.name in MOTOR_PARAMETERS
             and estimate.status in USABLE
             and estimate.low < estimate.high
         }
@@ -325,7 +322,7 @@ class Identified:
         """Return the drive with the identified and the known parameters.
 
         Raises:
-            ValueError: a parameter is neither; the message names it and a remedy.
+            ValueError: a parameter is neither identified nor known; the message names it.
         """
         from codrl_mj.actuators import Drive, Supply, actuator_from_mapping
 
@@ -338,7 +335,7 @@ class Identified:
             {
                 f"motor.{estimate.name}": estimate.value
                 for estimate in self.estimates
-                if estimate.name in OF_MOTOR
+                if estimate.name in MOTOR_PARAMETERS
             }
         )
 

@@ -10,7 +10,7 @@ _MEASURED = "position", "velocity", "current", "torque"
 
 
 def signal_findings(log: Log) -> Iterator[Finding]:
-    """Check each signal by itself."""
+    """Yield findings about each signal by itself."""
     for signal in log.signals:
         yield from _resolution(log, signal)
         # Commanded signals, such as the voltage, may rest at a limit or change seldom.
@@ -29,8 +29,8 @@ def _resolution(log: Log, signal: str) -> Iterator[Finding]:
     spread = float(np.ptp(values))
     if spread < 100.0 * step if signal == "position" else step > 0.1 * float(np.std(values)):
         text = (
-            f"{signal} is known to {step:.3g} {unit} and spans {spread:.3g} {unit},"
-            f" {spread / step:.0f} steps"
+            f"{signal} has a resolution of {step:.3g} {unit} and spans {spread:.3g} {unit}, which"
+            f" are {spread / step:.0f} steps"
         )
         remedies = {
             "position": "move further, or use a finer encoder",
@@ -47,19 +47,19 @@ def _repeated(log: Log, signal: str) -> Iterator[Finding]:
     if len(changes) < 20:
         return
     # A coarse sensor repeats its value too, but then moves on by a step or two of its resolution.
-    every, size = float(np.median(np.diff(changes))), float(np.median(np.abs(steps[changes])))
-    if every >= 2.0 and size > 2.5 * log.resolution.get(signal, 0.0):
+    period, change = float(np.median(np.diff(changes))), float(np.median(np.abs(steps[changes])))
+    if period >= 2.0 and change > 2.5 * log.resolution.get(signal, 0.0):
         unit = SIGNALS[signal]
         text = (
-            f"{signal} changes in every {every:.0f}th row only, by {size:.3g} {unit}: rows repeat"
-            " old values"
+            f"{signal} changes only in every {period:.0f}th row, by {change:.3g} {unit}: rows"
+            " repeat old values"
         )
         remedy = "log a row when a value is read, or leave out the rows that repeat it"
         yield Finding("warning", "repeated", int(log.row_numbers[changes[0] + 1]), text, remedy)
 
 
 def _saturation(log: Log, signal: str) -> Iterator[Finding]:
-    """Find values that accumulate at the highest or the lowest value, as in a clipped signal."""
+    """Find a signal that often rests at its highest or lowest value, as if it were clipped."""
     values = log.signals[signal]
     spread = float(np.ptp(values))
     for name, bound in (("highest", float(values.max())), ("lowest", float(values.min()))):
@@ -110,8 +110,8 @@ def _outliers(log: Log, signal: str) -> Iterator[Finding]:
             f" {outliers.size} rows ({rows})"
         )
         remedy = (
-            "none is needed up to 1 % of the rows, which a robust fit tolerates; else find their"
-            " cause"
+            "the robust fit tolerates outliers in up to 1 % of the rows; if there are more, find"
+            " their cause"
         )
         severity = "info" if outliers.size / len(values) <= 0.01 else "warning"
         yield Finding(severity, "outliers", int(log.row_numbers[outliers[0]]), text, remedy)

@@ -1,4 +1,4 @@
-"""Simulation of a winding and a shaft by the time stamps of a log, for fits and for synthetic logs.
+"""Simulation of a winding and a shaft at the time stamps of a log, for fits and synthetic logs.
 
 Friction is that of `GearMotor`: `codrl_mj.actuators.shaft.friction` is subtracted from the motor's
 torque, and then Coulomb friction stops and holds the shaft, as MuJoCo's friction constraint does.
@@ -23,8 +23,8 @@ class ShaftParameters(NamedTuple):
     """Inertia, load and friction of a shaft, at the motor's output."""
 
     inertia: float  # [kg*m^2], > 0
-    gravity: float  # largest torque of gravity [N*m], m*g*l, against sin(position)
-    constant_torque: float  # constant load [N*m], against positive speeds
+    gravity: float  # m*g*l [N*m]; the torque of gravity is -m*g*l*sin(position)
+    constant_torque: float  # constant load torque [N*m], positive if it opposes positive speeds
     coulomb: float  # [N*m]
     viscous: float  # [N*m*s/rad]
     gear_efficiency: float  # in (0, 1]
@@ -69,7 +69,7 @@ def simulate_winding(
     inductance: float,
     constant: float,
 ) -> np.ndarray:
-    """Return the currents [A] at the times, shape (n,), exactly for held voltages and speeds."""
+    """Return the currents [A] at the times, shape (n,), exact for held voltages and speeds."""
     currents = np.empty(len(times))
     currents[0] = current
     for row in range(len(times) - 1):
@@ -91,9 +91,9 @@ def step_shaft(
 ) -> tuple[float, float]:
     """Return position [rad] and speed [rad/s] after a duration [s].
 
-    The input begins at `drive` and grows by `slope` [1/s]. Gravity acts in the middle of a substep,
-    and viscous friction acts on its mean speed: both are of second order. Dry friction is an
-    implicit step, which never chatters.
+    The input begins at `drive` and grows by `slope` [1/s]. Gravity is evaluated in the middle of a
+    substep, and viscous friction at its mean speed, so that both are accurate to second order. Dry
+    friction is an implicit step, which never chatters.
     """
     substeps = max(math.ceil(duration / MAX_SUBSTEP - 1e-6), 1)
     step = duration / substeps
@@ -111,7 +111,7 @@ def step_shaft(
             1.0 + damping
         )
         if parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0:
-            # The gear transmits the motor's torque after its loss by the back-EMF.
+            # The gear transmits the motor's torque, which the back-EMF has already reduced.
             torque = driving - 0.5 * parameters.braking * (speed + free_speed)
             acceleration = (free_speed - speed) / step - torque / inertia
             free_speed -= (
@@ -188,19 +188,19 @@ def simulate_samples(
     locked: bool,
     position: float,
 ) -> np.ndarray:
-    """Simulate a drive, and return its states at each sample, shape (n, 5).
+    """Simulate a drive, and return its state at each sample, shape (n, 5).
 
-    The winding is exact between two samples at the speed in their middle; the shaft moves for half
-    a sample before and after it (Strang splitting, of second order).
+    The shaft moves for half a sample, then the winding is solved exactly for a whole sample at that
+    speed, then the shaft moves for the other half (Strang splitting, second order).
 
     Args:
-        period: of the samples [s].
-        shares: of the supply's voltage at each sample, in [-1, 1].
+        period: period of the samples [s].
+        shares: duty of the bridge at each sample, in [-1, 1].
         limit: voltage of the supply without load [V].
         sag: resistance of the supply [ohm].
-        parts: R, L and kE at the output, and `ShaftParameters`.
-        locked: whether the shaft is held.
-        position: at the start [rad].
+        parts: tuple of (R, L, kE at the output) and `ShaftParameters`.
+        locked: True if the shaft is held.
+        position: initial position [rad].
 
     Returns:
         Voltage, current, speed and position of the output, and voltage of the bus.

@@ -2,7 +2,8 @@
 
 Voltages are pure functions of time. Slow motion shows resistance, back-EMF and friction; only
 changes within the winding's time constant L/R show the inductance. A PRBS is a pseudo-random binary
-sequence, white up to its clock. Source: Ljung, *System Identification* (2nd ed. 1999), sec. 13.3.
+sequence with a nearly flat spectrum up to its clock rate. Source: Ljung, *System Identification*
+(2nd ed. 1999), sec. 13.3.
 """
 
 import dataclasses
@@ -101,7 +102,7 @@ class Load(Checked):
     gravity: float = real(0.0, minimum=0.0, unit="N*m")
     """m*g*l [N*m] of a pendulum that hangs at position 0, >= 0."""
     against: float = real(0.0, unit="N*m")
-    """Constant torque [N*m] against the motor, as that of a lifted weight."""
+    """Constant torque [N*m] against the motor, such as that of a lifted weight."""
     locked: bool = False
     """True if the shaft is held."""
 
@@ -111,7 +112,7 @@ FREE = Load()
 SIMULATED_SIGNALS = ("current", "position", "velocity", "torque", "bus", "voltage", "duty")
 """Signals of a simulated log."""
 _SAMPLE_SIZE, _ROW_SIZE = (80, 200)
-"""Measured memory [bytes] of a sample of the drive, and of a row until it is written."""
+"""Measured peak memory [bytes] for a sample of the drive, and for a row of the log."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +124,7 @@ class Sensor(Checked):
     resolution: float = real(0.0, minimum=0.0, unit="")
     """Step of the rounding, >= 0, in the signal's unit; 0: none."""
     delay: float = real(0.0, minimum=0.0, unit="s")
-    """Age [s] of the values, >= 0."""
+    """Delay [s] of the measured values, >= 0."""
     gain: float = real(1.0, unit="")
     """Measured value over the true value; -1 is a wrong sign."""
     bias: float = real(0.0, unit="")
@@ -151,11 +152,13 @@ class Sampler(Checked):
     rate: float = real(5000.0, above=0.0, unit="Hz")
     """Rows per second [Hz], > 0."""
     jitter: float = real(0.0, minimum=0.0, maximum=0.3)
-    """Standard deviation of the times over the period, in [0, 0.3]; time stamps are exact."""
+    """Standard deviation of the sampling times, as a share of the period, in [0, 0.3]. Time stamps
+    are the actual times.
+    """
     dropped: float = real(0.0, minimum=0.0, maximum=0.9)
     """Share of rows that are lost, in [0, 0.9]."""
     mean_voltage: bool = False
-    """True if a row has the mean voltage until the next row, False if the instantaneous one."""
+    """True if a row has the mean voltage until the next row; False for the voltage at its time."""
 
 
 def simulate_drive(
@@ -163,13 +166,13 @@ def simulate_drive(
 ) -> Log:
     """Simulate a drive without its control loop from standstill, and return its samples.
 
-    The bridge applies the share d = u/V of the supply's voltage V, which sags by the supply's
-    resistance times d*i.
+    The bridge applies a duty d = u/V. The voltage V of the supply sags by the resistance of the
+    supply times d*i.
 
     Args:
-        drive: to simulate.
-        excitation: voltage, or its values [V] at each sample.
-        load: at the output.
+        drive: drive to simulate.
+        excitation: excitation, or its voltages [V] at each sample.
+        load: load at the output.
         position: initial position [rad].
 
     Returns:
@@ -239,14 +242,14 @@ def simulate(
     The logged voltage is the requested one, without sag; the logged torque is n*kT*i.
 
     Args:
-        drive: to simulate.
-        excitation: voltage, or its values [V] at each sample of the drive.
-        load: at the output.
-        sensors: by signal; signals without a sensor are exact.
-        sampler: of the rows.
-        seed: of noise, outliers, jitter and dropped rows.
+        drive: drive to simulate.
+        excitation: excitation, or its voltages [V] at each sample of the drive.
+        load: load at the output.
+        sensors: sensors by signal; signals without a sensor are exact.
+        sampler: times of the rows.
+        seed: seed of noise, outliers, jitter and dropped rows.
         position: initial position [rad].
-        name: of the log.
+        name: name of the log.
     """
     if isinstance(excitation, Excitation):
         check_size(drive, excitation.duration, sampler.rate)
@@ -259,7 +262,7 @@ def simulate(
     time[1:-1] += (
         period * sampler.jitter * np.clip(random.standard_normal(max(len(time) - 2, 0)), -3.0, 3.0)
     )
-    # Times have to increase strictly, also with large jitter.
+    # Large jitter may swap neighboring times, but the times of a log have to increase strictly.
     time = np.maximum.accumulate(time + 1e-9 * period * np.arange(len(time)))
     torque = drive.motor.gear_ratio * drive.motor.torque_constant * samples.signals["current"]
     commanded, true_signals = samples.signals["command"], {**samples.signals, "torque": torque}

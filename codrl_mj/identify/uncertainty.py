@@ -2,8 +2,9 @@
 
 Intervals from the curvature at the optimum are valid only for an exact model, and no model is
 exact. So whole stretches of the logs are resampled, and the interval is widened by the differences
-between logs, by the error of a fit to its own simulation, and by the change at half the sample
-rate. Directions in which the parameters cannot be identified are named.
+between logs, by the error of a fit to data simulated with the fitted parameters (self-test), and by
+the change at half the sample rate. Directions in which the parameters cannot be identified are
+reported.
 """
 
 import dataclasses
@@ -16,27 +17,27 @@ import numpy as np
 from codrl_mj.identify.estimate import Fit, fit_warnings, optimize
 from codrl_mj.identify.log import BLOCK_DURATION, Log, halve_rate, has_motion, replace_signal
 from codrl_mj.identify.models import ShaftModel, WindingModel
-from codrl_mj.identify.parameters import DEFAULTS, FRICTION, OF_WINDING, PARAMETERS
+from codrl_mj.identify.parameters import DEFAULTS, FRICTION, PARAMETERS, WINDING_SOURCES
 from codrl_mj.identify.result import MAX_UNEXPLAINED, USABLE, Estimate, Status
 
 MIN_LOGS = 5
-"""Smallest number of logs of which whole logs are resampled; with fewer logs blocks are."""
+"""Smallest number of logs at which whole logs are resampled; with fewer logs, blocks are."""
 DRAWS = 500
 """Number of resamplings."""
-# In units in which each single parameter has the standard error 1, a direction has at most 1e6.
+# With parameters scaled to standard errors of 1, no direction gets a standard error above 1e6.
 MIN_EIGENVALUE = 1e-12
 """Smallest eigenvalue of a normalized Gauss-Newton matrix that is inverted."""
 ATTENUATION = 6.0
-"""Largest bias by errors of the input, over the unexplained share of the variance."""
+"""Largest relative bias from errors of the input, per unexplained share of the variance."""
 # Dry friction gives the cost many minima.
 SLACK = 1e-3
-"""Share of the cost by which a fit may be better by chance."""
-UNKNOWN = 0.5
-"""Relative change along a direction that must change the cost; else it is unidentifiable."""
+"""Share of the cost by which a fit may be better only because it reached another minimum."""
+PROBE_CHANGE = 0.5
+"""Relative change along a direction. The direction is unidentifiable if the cost hardly changes."""
 MIN_SHARE = 0.1
 """Smallest share of a parameter in a direction that is reported."""
 MAX_HALF_WIDTH = 0.3
-"""Largest relative half-width of a usable interval, for friction relative to its sum."""
+"""Largest relative half-width of a usable interval; for friction, relative to all friction."""
 MAX_IDENTIFIED = {
     "resistance": 0.05,
     "back_emf_constant": 0.05,
@@ -53,7 +54,7 @@ MIN_HALF_WIDTHS = {"inductance": 0.02}
 MAX_FRICTION = 0.1
 """Relative half-width beyond which a friction parameter is rough."""
 MAX_BIAS = 0.5
-"""Largest error of the self-test, over the largest half-width, that is not reported."""
+"""Largest error of the self-test, over the largest usable half-width, that is not reported."""
 CAUSES = {
     "curvature": "the logs hardly depend on it",
     "resampling": "parts of the logs disagree",
@@ -89,7 +90,7 @@ def assess_fits(
     for name, fit in parts.items():
         part_estimates, fixed = _assess_part(fit, seed, step(name)), fit.model.known
         # The shaft cannot be known better than the constant of the fitted winding.
-        for parameter, source in OF_WINDING.values():
+        for parameter, source in WINDING_SOURCES.values():
             if parameter in fixed and parameter not in known:
                 constant = [estimate for estimate in estimates if estimate.name == source]
                 part_estimates = (
@@ -122,7 +123,8 @@ def _assess_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estim
     if not names:
         return []
     friction, slopes_by_name, full_friction = _friction(fit)
-    # Changes are relative to the value or, for friction, to the value that would be all of it.
+    # Changes are relative to the value or, for friction, to the value at which that parameter alone
+    # would account for all friction.
     magnitudes = [
         full_friction[name] if name in FRICTION else abs(fit.values[index])
         for index, name in enumerate(names)
@@ -130,7 +132,7 @@ def _assess_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estim
     scales = np.maximum(magnitudes, 1e-6 * model.scales)
     slopes, matrix = np.array([slopes_by_name.get(name, 0.0) for name in names]), np.eye(len(names))
     values, sizes, units = fit.values, scales, model.scales
-    # The sum of all friction is often known better than its kinds.
+    # The sum of all friction is often known better than its components.
     if any(slopes):
         names, matrix, values = (
             (*names, "friction_torque"),
@@ -152,8 +154,8 @@ def _assess_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estim
         for direction, change in zip(directions, changes, strict=True)
         if abs(change) > MIN_SHARE
     ]
-    # The three statistical causes measure the same errors: the largest counts. The change at half
-    # the rate is independent of them, and biases are added.
+    # The three statistical causes measure the same errors, so that only the largest one counts. The
+    # change at half the rate is independent of them. Biases are added.
     statistical = np.max([by_cause[cause] for cause in ("curvature", "resampling", "logs")], axis=0)
     total = (
         np.hypot(statistical, by_cause["half_rate"])
@@ -164,7 +166,7 @@ def _assess_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estim
         total, [MIN_HALF_WIDTHS.get(name, MIN_HALF_WIDTH) for name in names] * values
     )
     max_half_widths = dict.fromkeys(names, MAX_HALF_WIDTH)
-    # If the sum is known well, an error of one kind of friction is compensated by another kind.
+    # If the sum is known well, errors of its components compensate each other.
     if any(slopes) and half_widths[-1] <= MAX_FRICTION * values[-1]:
         max_half_widths |= {name: 1.0 for name in names if name in FRICTION}
     estimates = []
@@ -219,12 +221,12 @@ def _verdict(
     """Return the status of a parameter, and the reason.
 
     Args:
-        estimate: without a status.
-        half_width: of the interval.
-        size: that the half-width is relative to.
+        estimate: estimate without a final status.
+        half_width: half-width of the interval.
+        size: reference of relative half-widths.
         unit: scale for the distance from a bound.
         max_half_width: largest usable half-width, relative to `size`.
-        self_test_value: value from a fit to its own simulation.
+        self_test_value: value from a fit to data that were simulated with the fitted parameters.
     """
     name, value, lower, upper = (
         estimate.name,
@@ -261,7 +263,10 @@ def _verdict(
         addition = ", and a larger share of its value" if name != "friction_torque" else ""
         return "rough", f"its interval is {share:.3g} % of all friction to either side{addition}"
     if not half_width <= MAX_IDENTIFIED.get(name, MAX_HALF_WIDTH) * size:
-        return "rough", f"its interval is {share:.3g} % of it to either side: train across it"
+        return (
+            "rough",
+            f"its interval is {share:.3g} % of it to either side: randomize it in training",
+        )
     return "identified", ""
 
 
@@ -301,9 +306,9 @@ def _widen_by_constant(
 
 
 def _update_status(estimates: list[Estimate]) -> list[Estimate]:
-    """Return estimates with the status of their widened intervals.
+    """Return estimates whose status corresponds to their widened intervals.
 
-    The interval of the sum of all friction counts for each kind of friction.
+    Parameters of friction are judged by the interval of the sum of all friction.
     """
     shares = {
         estimate.name: (estimate.high - estimate.value) / max(abs(estimate.value), 1e-300)
@@ -338,8 +343,8 @@ def _friction(fit: Fit) -> tuple[float, dict[str, float], dict[str, float]]:
 
     Returns:
         The sum of all friction at the rotor [N*m], its derivatives with respect to the friction
-        parameters, and the value of each parameter that alone would give all friction. A hundredth
-        of the driving torque is added to the latter, because that is as good as no friction.
+        parameters, and the value of each parameter that alone would give all friction. For the
+        latter a hundredth of the driving torque is added, because less friction is negligible.
     """
     if not isinstance(model := fit.model, ShaftModel):
         return 0.0, {}, {}
@@ -387,9 +392,9 @@ def _complete(
     for name, value in defaults.items():
         if name in PARAMETERS and name not in by_name and value != DEFAULTS[name]:
             by_name[name] = Estimate(
-                name, value, value, value, "given", "the motor's, which the fit took as known"
+                name, value, value, value, "given", "value of the motor, taken as known"
             )
-    # In SI units the torque constant and the back-EMF constant are equal but for losses.
+    # In SI units the torque constant and the back-EMF constant are equal, except for losses.
     constants = {"torque_constant": "torque constant", "back_emf_constant": "back-EMF constant"}
     for name, source in zip(constants, reversed(constants), strict=True):
         if name not in by_name and source in by_name:
@@ -460,11 +465,11 @@ def interval_causes(
     """Return the half-widths of intervals by cause, and the values from the self-test.
 
     Args:
-        fit: to assess.
+        fit: fit to assess.
         values: linear combinations of the parameters, shape (q,).
-        scales: of the parameters, shape (p,).
+        scales: scales of the parameters, shape (p,).
         matrix: derivatives of the combinations with respect to the parameters, shape (q, p).
-        seed: of the resampling.
+        seed: seed of the resampling.
         on_step: called after each step.
     """
     is_winding = isinstance(fit.model, WindingModel)
@@ -479,18 +484,18 @@ def interval_causes(
         - fit.values
     )
     on_step()
-    # If an error is proportional to the time step, the fit at half the rate changes by as much as
-    # the error at the full rate; if it grows with the root of the step, the error is larger than
-    # that.
+    # If an error is proportional to the time step, halving the rate changes the fit by as much as
+    # the error at the full rate. If it grows only with the root of the step, the error is larger
+    # than that change, which is why it is doubled for a winding.
     half_rate_values = _refit_values(fit, [halve_rate(log) for log in fit.logs])
     causes["half_rate"] = (2.0 if is_winding else 1.0) * np.abs(
         matrix @ (half_rate_values - fit.values)
     )
     on_step()
     causes["self_test"] = np.abs(self_test_values - values)
-    # Errors of the input, as those of a voltage that changes between the rows, attenuate its factor
-    # by a multiple of their share of the variance: 2 to 4.6 for a PRBS whose clock is 1 to 4 rows.
-    # A fit of fewer rows does not show this.
+    # Errors of the input, for example of a voltage that changes between rows, bias its coefficient
+    # toward 0. For a PRBS with a clock of 1 to 4 rows, the relative bias is 2 to 4.6 times the
+    # share of these errors in the variance. A fit at half the rate does not reveal it.
     residual_squares = sum(
         segment.deviation**2 * float(fit.weights(i) @ fit.residuals[i] ** 2)
         for i, segment in enumerate(fit.segments)
@@ -515,10 +520,10 @@ def resampled_half_widths(
     for a single log.
 
     Args:
-        fit: to assess.
-        scales: of the parameters, shape (p,).
+        fit: fit to assess.
+        scales: scales of the parameters, shape (p,).
         matrix: derivatives of the assessed values with respect to the parameters, shape (q, p).
-        seed: of the resampling.
+        seed: seed of the resampling.
     """
     from scipy.stats import t
 
@@ -569,8 +574,8 @@ def unidentifiable_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, fl
     friction makes the cost rough, so that a flat direction looks identified.
 
     Args:
-        fit: to assess.
-        scales: of the parameters, shape (p,).
+        fit: fit to assess.
+        scales: scales of the parameters, shape (p,).
 
     Returns:
         Shares of the parameters in each direction by name, the largest being 1.
@@ -586,7 +591,7 @@ def unidentifiable_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, fl
         # The eigenvector of the smallest eigenvalue is a unit vector in the scales.
         direction = np.linalg.eigh(matrix * np.outer(sizes, sizes))[1][:, 0]
         index = int(np.argmax(np.abs(direction)))
-        step = UNKNOWN * sizes[index] * np.sign(direction[index])
+        step = PROBE_CHANGE * sizes[index] * np.sign(direction[index])
         bounds = PARAMETERS[model.names[index]]
         if not bounds.lower <= values[index] + step <= bounds.upper:
             step = -step
@@ -642,10 +647,11 @@ def _refit_values(fit: Fit, logs: Sequence[Log]) -> np.ndarray:
 
 
 def _simulated_logs(fit: Fit, sign: float) -> list[Log]:
-    """Simulate the logs of a fit with its residuals as noise, rounded as by their sensors.
+    """Simulate the logs of a fit with its residuals as noise, at the resolution of their sensors.
 
-    For a winding the motion is replaced, too, by the one that the fit used. The residuals of each
-    segment keep their order and size, with a random sign, so that their correlation is preserved.
+    For a winding, the motion is also replaced by the motion that the fit used. The residuals of
+    each segment keep their order and size, which preserves their correlation, but get a random
+    sign.
     """
     output, simulate = fit.model.output, fit.model.simulator(fit.values)
     signals = [log.signals[output].copy() for log in fit.logs]

@@ -1,4 +1,4 @@
-"""Sizing of drives: limits, current loops, demands and choice; docs/motors.md."""
+"""Sizing of drives: limits, current loops, demands of tasks and choice of a motor."""
 
 from codrl_mj.sizing.abilities import (
     Abilities,

@@ -1,10 +1,9 @@
-"""Drives by name, their steady-state limits and datasheets; closed forms of V = R*I + kE*omega.
+"""Drives by name, their datasheets, and their steady-state limits from V = R*I + kE*omega.
 
 Source: maxon, *Key information on maxon DC and EC motors*; `codrl_mj.catalogue` derives its numbers
-by the same relations. As in the simulation, kT*I passes the gear first: the gear multiplies a
-driving torque by its efficiency and a braking torque by 1/efficiency. Friction at the output,
-n*(c + n*b*|omega|), opposes the speed after the gear. All torques here are net of both: they move
-the load.
+by the same relations. As in the simulation, the gear multiplies a driving torque kT*I by its
+efficiency, and a braking torque by 1/efficiency. Then friction at the output, n*(c + n*b*|omega|),
+opposes the speed. All torques in this module are net of both losses, and so move the load.
 """
 
 import dataclasses
@@ -64,7 +63,7 @@ def find_drive(
         base = override_actuator(base, {"family": Drive.family})
     if type(base) is not Drive:
         raise ValueError(
-            f"motor = {name!r}: no motor behind a drive, but the actuator family {base.family};"
+            f"motor = {name!r}: is not a drive, but of the actuator family {base.family};"
             " name a motor of the catalogue (codrl-mj motor list), a TOML file with a datasheet,"
             " or an actuator of the family drive"
         )
@@ -93,7 +92,7 @@ class Abilities(NamedTuple):
     """Stall torque [N*m] within `max_current`."""
 
     stall_torque: float
-    """Largest torque at the output just before it turns [N*m]."""
+    """Torque at the blocked output with the stall current [N*m]."""
     stall_current: float
     """Current of the blocked motor [A]: V/R."""
     no_load_speed: float
@@ -117,9 +116,9 @@ def abilities(drive: Drive) -> Abilities:
     motor, resistance = drive.motor, drive.motor.resistance + drive.supply_resistance
     torque_per_current = motor.torque_constant * motor.gear_efficiency  # [N*m/A]
     voltage_per_torque = resistance / torque_per_current  # [V/(N*m)]
-    slope = motor.back_emf_constant + voltage_per_torque * motor.viscous_friction
+    voltage_per_speed = motor.back_emf_constant + voltage_per_torque * motor.viscous_friction
     effective_voltage = max(drive.voltage_limit - voltage_per_torque * motor.coulomb_friction, 0.0)
-    speed = effective_voltage / slope if slope > 0.0 else math.inf
+    speed = effective_voltage / voltage_per_speed if voltage_per_speed > 0.0 else math.inf
     friction = motor.coulomb_friction + (
         motor.viscous_friction * speed if motor.viscous_friction > 0.0 else 0.0
     )
@@ -155,7 +154,7 @@ def max_power(drive: Drive) -> float:
 
 
 def continuous_torque(drive: Drive, current: float | None) -> float | None:
-    """Return the standstill torque [N*m] of a continuous current [A]; None if unknown."""
+    """Return the standstill torque [N*m] at a continuous current [A]; None if that is unknown."""
     return (
         None
         if current is None
@@ -164,13 +163,17 @@ def continuous_torque(drive: Drive, current: float | None) -> float | None:
 
 
 def diagram_limits(drive: Drive, numbers: Any = None) -> list[tuple[str, float, int]]:
-    """Return the limits in a torque-speed diagram, each as (name, current [A], kind).
+    """Return the limits of a drive for a torque-speed diagram, as (name, current [A], kind).
 
-    The kind is 0 for the voltage limit (its current is infinite), 1 for the peak current and 2 for
+    The kind is 0 for the voltage limit, whose current is infinite, 1 for the peak current and 2 for
     the continuous current.
 
+    Args:
+        drive: drive.
+        numbers: `MotorParameters` of its datasheet; None leaves out the continuous current.
+
     Raises:
-        ValueError: the drive has no finite no-load speed, which ends the diagram.
+        ValueError: the no-load speed, at which the diagram ends, is not finite or not positive.
     """
     limits, peak_current = abilities(drive), drive.controller.max_current
     if not 0.0 < limits.no_load_speed < math.inf or limits.stall_torque <= 0.0:
@@ -199,7 +202,7 @@ def torque_limits(
     Above the no-load speed the back-EMF drives a current regardless of the current limit.
 
     Args:
-        drive: the drive.
+        drive: drive with motor, gear and supply.
         speeds: speeds of the output [rad/s], any shape.
         current: limit of the absolute current [A], such as the drive's `max_current`.
     """
@@ -218,10 +221,10 @@ def highest_current(
     # Beyond the no-load speed i < 0, so that u = V + sag*i and (R - sag)*i = V - b. At u = 0 the
     # back-EMF b alone drives -b/R, which is the lower bound.
     reverse_resistance = max(resistance - sag, 1e-9 * resistance)
-    driven = (voltage - back_emf) / np.where(
+    steady = (voltage - back_emf) / np.where(
         back_emf > voltage, reverse_resistance, resistance + sag
     )
-    return np.maximum(driven, -back_emf / resistance)
+    return np.maximum(steady, -back_emf / resistance)
 
 
 def _at_output(motor: GearMotor, current: np.ndarray, speed: np.ndarray) -> np.ndarray:
@@ -233,8 +236,8 @@ def _at_output(motor: GearMotor, current: np.ndarray, speed: np.ndarray) -> np.n
     friction = motor.coulomb_friction + motor.viscous_friction * motor.gear_ratio * np.abs(speed)
     friction = friction + motor.stribeck(motor.gear_ratio * speed)
     # At standstill friction only cancels torque; it never moves the joint.
-    still = np.sign(torque) * np.maximum(np.abs(torque) - friction, 0.0)
-    return motor.gear_ratio * np.where(speed == 0.0, still, torque - friction * np.sign(speed))
+    static = np.sign(torque) * np.maximum(np.abs(torque) - friction, 0.0)
+    return motor.gear_ratio * np.where(speed == 0.0, static, torque - friction * np.sign(speed))
 
 
 # -- datasheets ------------------------------------------------------------------------------------
@@ -255,11 +258,13 @@ COLUMNS = (
 )
 """Columns of `catalogue_rows`, in SI units."""
 _ROUNDED = 0.01
-"""Relative difference below which a disagreement of a datasheet counts as rounding."""
+"""Relative difference below which inconsistent values of a datasheet count as rounded."""
 
 
 def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
-    """Return a row for every catalogue motor at its nominal voltage, or 24 V; None if unknown.
+    """Return a row for each catalogue motor at its nominal voltage, or at 24 V.
+
+    Unknown values are None.
 
     Args:
         sort: one of `COLUMNS`: names and kinds from A to Z, numbers descending, unknown ones last.
@@ -295,9 +300,9 @@ def explain(
     """Return all known data of a motor: JSON-serializable, except for infinite values.
 
     Args:
-        drive: the motor with its drive.
-        entry: its datasheet, if it has one.
-        loop: the outer loops, if it is a servo.
+        drive: drive with motor, controller and supply.
+        entry: datasheet of the motor, or None.
+        loop: outer loops of a servo, or None.
 
     Returns:
         `drive` (the fields of motor, controller, supply and loop) and `abilities`, each a list of
@@ -338,11 +343,7 @@ def explain(
     ]
     derived = entry.parameters.derived
     sources = {name: _sources(derived[name], entry) for name in names if name in derived}
-    cited = list(
-        dict.fromkeys(
-            source for names_of_sources in sources.values() for source in names_of_sources
-        )
-    )
+    cited = list(dict.fromkeys(source for group in sources.values() for source in group))
     rounded = [
         disagreement.quantity
         for disagreement in entry.parameters.disagreements
@@ -361,12 +362,10 @@ def explain(
             _value(name, getattr(entry.parameters, name), KINDS[PRINTED_NAMES.get(name, name)].unit)
             | {
                 "how": derived[name],
-                "sources": own_sources,
-                "places": ", ".join(
-                    str(1 + cited.index(disagreement)) for disagreement in own_sources
-                ),
+                "sources": value_sources,
+                "places": ", ".join(str(1 + cited.index(citation)) for citation in value_sources),
             }
-            for name, own_sources in sources.items()
+            for name, value_sources in sources.items()
         ],
         "cited": cited,
         "unknown": [name for name in names if name not in derived],
@@ -389,7 +388,7 @@ def _value(name: str, value: Any, unit: str) -> dict[str, Any]:
 
 
 def _sources(sentence: str, entry: MotorEntry) -> list[str]:
-    """Return the sources of the values that a sentence of `MotorParameters.derived` names."""
+    """Return the sources of all values that a derivation in `MotorParameters.derived` names."""
     known = (
         entry.sources.get(word) for word in re.findall(r"\w+", sentence.replace("_at_output", ""))
     )

@@ -28,33 +28,35 @@ from codrl_mj.sizing.feasibility import (
 MARGIN = 0.2
 """Required margin of voltage and currents: a rule of thumb for tolerances of motor and supply."""
 _SPREAD = math.log(16.0)
-"""Search range of log(gear ratio) on either side of the ratio for largest torque and speed."""
+"""Search range of log(gear ratio) on either side of the best ratio for the largest torque and
+speed of the demand.
+"""
 _OPTIONAL_NUMBERS = (
     "coulomb_friction",
     "viscous_friction",
     "gear_efficiency",
     "continuous_current",
 )
-"""Numbers that are ignored if a datasheet omits them, besides those in `Drive.assumed`."""
+"""Quantities that are ignored if a datasheet omits them, besides those in `Drive.assumed`."""
 
 
 class Candidate(NamedTuple):
-    """Motor with a gear, and its judgment."""
+    """Motor with a gear, and its feasibility."""
 
     name: str
     """Name of the motor."""
     drive: Drive
     """Motor with gear and supply."""
     unknown: tuple[str, ...]
-    """Numbers that its datasheet omits and that are ignored."""
+    """Quantities that its datasheet omits and that are ignored."""
     feasibility: Feasibility
-    """Judgment of the motor."""
+    """Feasibility of the demand on the motor."""
     rejection_reason: str
     """Reason why it is rejected; empty if it is suitable."""
 
     def for_model_gear(self, gear: float) -> Drive:
         """Return the drive for an actuator whose model has a gear (`Demand.model_gear`)."""
-        # The model multiplies the force by its gear; a larger arm divides it again.
+        # The model multiplies the force by its gear; the larger arm radius compensates for that.
         return self.drive.replaced({"motor.arm_radius": gear * self.drive.motor.arm_radius})
 
     @property
@@ -108,26 +110,27 @@ def choose(
 ) -> list[Candidate]:
     """Rank motors with gears: suitable ones by size, then the others by verdict and shortage.
 
-    A motor is suitable if `feasibility` returns `surely` with a margin. A larger motor than needed
-    is no advantage: it is expensive and heavy, and accelerates its own rotor. A motor with a gear
-    keeps it, and on a slide gets a wheel; the others get the gear of `with_best_gear`.
+    A motor is suitable if `feasibility` returns `surely` with the required margin. A larger motor
+    than needed is no advantage: it is expensive and heavy, and has to accelerate a larger rotor. A
+    motor with a gear keeps its gear, and on a slide gets a wheel; others get the gear of
+    `with_best_gear`.
 
     Args:
-        demand: the demand.
-        motors: names; None takes the whole catalogue.
-        voltage: voltage of the supply [V]; None takes each motor's nominal one.
+        demand: demand of the joint.
+        motors: names of motors; None takes the whole catalogue.
+        voltage: voltage of the supply [V]; None takes each motor's nominal voltage.
         min_margin: required margin of voltage, largest and continuous current, in [0, 1).
         gears: available ratios, turns of the rotor for one turn of the joint, on a slide [rad/m];
             every motor is judged with each of them.
-        max_current: largest current of the drive [A]; None takes each motor's.
+        max_current: largest current of the drive [A]; None keeps the limit of each motor.
 
     Raises:
         ValueError: a motor is unknown, or the margin or a gear is out of bounds.
     """
     if not 0.0 <= min_margin < 1.0:
         raise ValueError(
-            f"min_margin = {min_margin:g}: must be >= 0 and < 1, the required share that is left,"
-            f" such as {MARGIN:g}"
+            f"min_margin = {min_margin:g}: must be >= 0 and < 1, the share of voltage and current"
+            f" to keep in reserve, such as {MARGIN:g}"
         )
     choices = []
     for name in motor_names() if motors is None else motors:
@@ -168,53 +171,55 @@ def _rejection_reason(judgment: Feasibility, min_margin: float) -> str:
     return (
         ""
         if judgment.margin >= min_margin
-        else f"surely, but with a margin of {judgment.margin:.0%}, must be {min_margin:.0%}"
+        else f"surely, but with a margin of {judgment.margin:.0%}, must be >= {min_margin:.0%}"
     )
 
 
 def with_best_gear(drive: Drive, demand: Demand, continuous: float | None = None) -> Drive:
     """Return the drive with the gear (or wheel, on a slide) of the largest margin.
 
-    The ratio is >= 1. If possible with a positive margin, Coulomb friction takes at most
-    `MAX_FRICTION_SHARE` of the load.
+    The ratio is >= 1 at a rotary joint. Coulomb friction takes at most `MAX_FRICTION_SHARE` of the
+    load, if a positive margin is possible with such a ratio.
 
     Args:
-        drive: the motor, with any gear.
-        demand: the demand.
+        drive: motor with any gear.
+        demand: demand of the joint.
         continuous: continuous current of the winding [A]; None if unknown.
     """
     from scipy.optimize import minimize_scalar
 
-    low, high = _logarithms(drive, demand)
+    low, high = _log_ratio_bounds(drive, demand)
     if low == high:
         return drive
 
-    # Except for friction, each part of the load is a maximum of functions a/N + b*N of the ratio N.
-    # It has one minimum over N, which a bounded scalar search finds.
-    def load(logarithm: float) -> float:
+    # Except for friction, each term of the utilization is a maximum of functions a/N + b*N of the
+    # ratio N. So the utilization has one minimum over N, which a bounded scalar search finds.
+    def utilization(logarithm: float) -> float:
         with_gear = _with_ratio(drive, demand, logarithm)
         required = operation(demand, with_gear)
-        own_load = 0.0 if demand.exact else required.own_share / MAX_ROTOR_SHARE
-        return max(1.0 - margin(with_gear, required, continuous), own_load)
+        rotor_share = 0.0 if demand.exact else required.own_share / MAX_ROTOR_SHARE
+        return max(1.0 - margin(with_gear, required, continuous), rotor_share)
 
     def best_below(highest: float) -> Drive:
         within = low, max(min(highest, high), low + 1e-9)
-        optimum = minimize_scalar(load, bounds=within, method="bounded", options={"xatol": 0.01}).x
+        optimum = minimize_scalar(
+            utilization, bounds=within, method="bounded", options={"xatol": 0.01}
+        ).x
         return _with_ratio(drive, demand, float(optimum))
 
     # Friction at the joint grows with the ratio, so its limit is an upper bound on the ratio.
     friction = 0.0 if demand.exact else friction_share(_with_ratio(drive, demand, 0.0), demand)
     if friction > 0.0 and MAX_FRICTION_SHARE / friction > math.exp(low):
-        smooth = best_below(math.log(MAX_FRICTION_SHARE / friction))
-        if margin(smooth, operation(demand, smooth), continuous) >= 0.0:
-            return smooth
+        limited = best_below(math.log(MAX_FRICTION_SHARE / friction))
+        if margin(limited, operation(demand, limited), continuous) >= 0.0:
+            return limited
     return best_below(math.inf)
 
 
 def equivalent_gears(
     best: Drive, demand: Demand, continuous: float | None = None
 ) -> tuple[float, float]:
-    """Return the lowest and highest ratio around the best one with the same verdict."""
+    """Return the lowest and highest ratio with the same verdict as the best ratio."""
     verdict, middle = feasibility(best, demand, continuous).verdict, -math.log(best.arm_radius)
 
     def edge(outside: float) -> float:
@@ -229,11 +234,11 @@ def equivalent_gears(
             inside, outside = (candidate, outside) if has_same_verdict else (inside, candidate)
         return math.exp(inside)
 
-    low, high = _logarithms(best, demand)
+    low, high = _log_ratio_bounds(best, demand)
     return edge(low), edge(high)
 
 
-def _logarithms(drive: Drive, demand: Demand) -> tuple[float, float]:
+def _log_ratio_bounds(drive: Drive, demand: Demand) -> tuple[float, float]:
     """Return the logarithms of the lowest and highest ratio to try.
 
     Both are the drive's ratio if the ratio makes no difference. The lowest ratio of a rotary joint

@@ -35,16 +35,16 @@ class Demand:
     speed: np.ndarray
     """Speed of the joint [rad/s] at the start of each step, shape (T,), as the drive sees it."""
     acceleration: np.ndarray
-    """Acceleration of the joint [rad/s^2], by differences, shape (T,)."""
+    """Acceleration of the joint [rad/s^2], from differences of the speed, shape (T,)."""
     episodes: int = 1
     """Number of episodes."""
     exact: bool = False
-    """True if the motor must follow it exactly. If False, another policy may need less."""
+    """True if the motor must follow the demand exactly. If False, another policy may need less."""
     linear: bool = False
     """True if the joint is a slide."""
     servo: bool = False
-    """True if a position or velocity servo of the model makes the torque. It tolerates less torque
-    and then moves more slowly.
+    """True if a position or velocity servo of the model produces the torque. Such a joint tolerates
+    less torque, and then moves more slowly.
     """
     swing: Swing | None = None
     """Pendulum of a swing-up task; None for other tasks."""
@@ -74,7 +74,10 @@ def demand_of(
     if motor is None:
         return next(iter(demands.values()))
     if motor not in demands:
-        names = ", ".join(name for name in demands if name) or "none that has a name: leave it out"
+        names = (
+            ", ".join(name for name in demands if name)
+            or "only motors without a name: leave it out"
+        )
         raise ValueError(f"motor = {motor!r}: {did_you_mean(motor, demands)}there are {names}")
     return demands[motor]
 

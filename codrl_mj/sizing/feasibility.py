@@ -31,8 +31,8 @@ class Operation(NamedTuple):
     energy_drawn: float
     """Electrical energy drawn in an episode [J]; returned energy is not subtracted."""
     own_share: float
-    """Largest torque on rotor and friction, over the largest joint torque; a lower bound if the
-    rotor's inertia is unknown (0).
+    """Largest torque for rotor acceleration and friction, over the largest joint torque. It is a
+    lower bound if the rotor's inertia is unknown (0).
     """
 
 
@@ -45,9 +45,10 @@ def operation(demand: Demand, drive: Drive) -> Operation:
         i = tau_rotor / kT
         V >= |R i + L di/dt + N kE omega| + R_supply |i|, with and without L di/dt.
 
-    tau_c includes Stribeck friction. The current changes within one step of the demand, also from
-    one episode to the next. If the motor brakes or holds, eta is 1, because then the losses of the
-    gear help. Energies use the mean speed in a step, all other values the speed at its start.
+    tau_c includes Stribeck friction. di is the change of the current from the step before, which
+    may be the last one of the previous episode. If the motor brakes or holds, eta is 1, because
+    then the losses of the gear help. Energies use the mean speed in a step, all other values the
+    speed at its start.
     """
     motor, added, arm = drive.motor, drive.additions, drive.arm_radius
     stribeck = motor.stribeck(demand.speed / arm) / arm
@@ -75,7 +76,7 @@ def operation(demand: Demand, drive: Drive) -> Operation:
 
 
 def best_ratio(torque: Any, speed: Any, motor: GearMotor) -> Any:
-    """Return the gear N with the lowest voltage for a torque [N*m] at a speed [rad/s].
+    """Return the gear ratio N that needs the lowest voltage for a torque [N*m] and a speed [rad/s].
 
     It minimizes R tau/(N kT) + N kE omega over N, without rotor inertia and friction; the minimum
     is 2 N kE omega.
@@ -99,16 +100,18 @@ VERDICTS = (SURELY, DEPENDS, TRY_IT, HOPELESS, SURELY_NOT)
 SUFFICIENT = ("voltage", "current", "heat", "rotor", "friction")
 """Bounds that are sufficient together."""
 MAX_ROTOR_SHARE = 0.5
-"""Largest share of the load for rotor and friction: the task limits a policy's command."""
+"""Largest share of the load for rotor and friction. The task limits the command of a policy, which
+has to supply this share in addition to the load.
+"""
 MAX_FRICTION_SHARE = 0.05
 """Largest share of the load for Coulomb friction at the joint. With this much friction, policies
 trained without it lost at most 0.05 of the score on five tasks and 0.10 on Mountain Car, and with
 twice as much up to 0.18 (docs/results/actuators.md).
 """
-SHORT = 10.0
-"""Factor of shortage that is hopeless: in simulations no motor short by more than 7 succeeded."""
-BRIEF = 0.01
-"""Share of time in which the shortage may be larger: a policy can avoid a peak, as at an impact."""
+HOPELESS_RATIO = 10.0
+"""Ratio of needed to available that is hopeless: in simulations no motor with over 7 succeeded."""
+MAX_PEAK_SHARE = 0.01
+"""Share of time in which peaks are ignored: a policy can avoid them, for example at an impact."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +150,7 @@ class Bound:
 
 @dataclasses.dataclass(frozen=True)
 class Feasibility:
-    """Judgment of a motor for a task."""
+    """Judgment whether a motor can meet a demand, with its reasons."""
 
     bounds: tuple[Bound, ...]
     """All applicable bounds."""
@@ -200,12 +203,13 @@ def feasibility(
     """Judge whether a motor can meet a demand.
 
     The bounds of `SUFFICIENT` are sufficient together. `stall` and `power` are necessary to follow
-    the demand, and therefore decide if it is exact; otherwise another policy may need less. `swing`
-    is necessary for every policy.
+    the demand, and exclude a motor if the demand is exact. Otherwise another policy may need less,
+    so that they exclude only a motor without any stall torque. `swing` is necessary for every
+    policy.
 
     Args:
-        drive: the motor with gear and supply; a rotor inertia of 0 counts as unknown.
-        demand: the demand.
+        drive: motor with gear and supply; a rotor inertia of 0 counts as unknown.
+        demand: demand of the joint.
         continuous_current: continuous current of the winding [A]; None if unknown.
 
     Raises:
@@ -213,8 +217,8 @@ def feasibility(
     """
     if not isinstance(drive, Drive):
         raise ValueError(
-            f"{drive!r}: must be a codrl_mj.actuators.Drive, a motor with gear and supply, or a"
-            " catalogue's name"
+            f"{drive!r}: must be a codrl_mj.actuators.Drive, a motor with gear and supply;"
+            " codrl_mj.sizing.find_drive returns one for a name"
         )
     required, unmet = operation(demand, drive), SURELY_NOT if demand.exact else TRY_IT
     bounds = []
@@ -224,10 +228,10 @@ def feasibility(
         holds = needed <= available
         verdict, hopeless_limit = (
             verdicts[not holds],
-            available * (math.sqrt(SHORT) if name == "heat" else SHORT),
+            available * (math.sqrt(HOPELESS_RATIO) if name == "heat" else HOPELESS_RATIO),
         )
-        # A shortage during brief peaks only is not hopeless.
-        lasting = float(np.quantile(load, 1.0 - BRIEF))
+        # A shortage that occurs only during brief peaks is not hopeless.
+        lasting = float(np.quantile(load, 1.0 - MAX_PEAK_SHARE))
         if (
             name in _MAY_BE_HOPELESS
             and not holds
@@ -239,9 +243,7 @@ def feasibility(
         if math.isnan(available):
             verdict = DEPENDS
         elif demand.servo and name in _LATE_SERVO:
-            remedy = (
-                "its servo asks for less where the motor is slower: evaluate the run on this motor"
-            )
+            remedy = "a servo asks for less if the motor is slower: evaluate the run on this motor"
         bounds.append(
             Bound(name, formula, needed, available, unit, holds, verdict, "" if holds else remedy)
         )
@@ -256,9 +258,11 @@ def feasibility(
 
 
 _MAY_BE_HOPELESS = ("voltage", "current", "heat", "stall")
-"""Bounds whose shortage can be hopeless. Power is none of them: a policy may work more slowly."""
+"""Bounds whose shortage can be hopeless; not power, because a policy may move more slowly."""
 _LATE_SERVO = ("voltage", "current", "rotor", "power")
-"""Bounds on the demand of a servo, which on ideal motors is as fast as its force allows."""
+"""Bounds on which a position or velocity servo asks for less on a real motor: on ideal motors it is
+as fast as its force allows.
+"""
 _Row = tuple[str, str, Any, float, str, tuple[str, str], str]
 
 
@@ -267,9 +271,9 @@ def _conditions(
 ) -> Iterator[_Row]:
     """Yield name, formula, load, available, unit, verdicts and remedy of the general bounds.
 
-    Sufficient together: voltage and current at every operating point, heat, and, unless the demand
-    is exact, the shares of rotor and friction. Necessary to follow the demand: torque at
-    standstill, and power with any gear.
+    These bounds are sufficient together: voltage and current at every operating point, heat and,
+    unless the demand is exact, the shares of rotor and friction. These are necessary to follow the
+    demand: torque at standstill, and power with any gear.
     """
     motor, limit, max_current = drive.motor, drive.voltage_limit, drive.controller.max_current
     currents, unit = np.abs(required.current), "N" if demand.linear else "N*m"
@@ -313,7 +317,7 @@ def _conditions(
     stall_torque -= motor.stribeck_friction / drive.arm_radius
     verdicts = TRY_IT, unmet if stall_torque > 0.0 else SURELY_NOT
     remedy = "raise the supply, the largest current or the gear"
-    yield "stall", "|tau| but of braking, largest", driving, stall_torque, unit, verdicts, remedy
+    yield "stall", "|tau| except braking, largest", driving, stall_torque, unit, verdicts, remedy
     peak = int(np.argmax(power))
     torque, speed, min_voltage = (
         abs(float(demand.torque[peak])) / motor.gear_efficiency,
@@ -331,7 +335,7 @@ def _conditions(
         f"no gear helps: raise the supply to {min_voltage:.4g} V and the largest current, or take a"
         " stronger motor"
     )
-    remedy = remedy if demand.exact else f"to follow exactly this run, {remedy}"
+    remedy = remedy if demand.exact else f"to follow this run exactly, {remedy}"
     yield (
         "power",
         "tau omega / eta, largest",
@@ -344,7 +348,7 @@ def _conditions(
 
 
 def _time_within(load: np.ndarray, available: float, unit: str) -> str:
-    """Return the share of time in which the motor has what is needed, as text."""
+    """Return text with the share of time in which the available value suffices."""
     return (
         f" ({available:.4g} {unit} suffice for"
         f" {math.floor(100.0 * float(np.mean(load <= available)))}% of the time)"
@@ -424,11 +428,11 @@ def _unknown_rotor(drive: Drive, demand: Demand, continuous: float | None) -> li
 
 def _swing_bounds(drive: Drive, swing: Swing) -> list[Bound]:
     """Return the bounds on the energy of every swing of a swing-up."""
-    # The estimate of the pumped energy decides nothing alone; the exact bound excludes the motor.
+    # The pumped energy is an estimate, which cannot exclude a motor; only the exact bound can.
     bounds = []
     for name, formula, energy, unmet in (
-        ("pumping", "energy from a swing, least", min_pumped_energy, TRY_IT),
-        ("swing", "energy from rest to rest, least", min_energy_gain, SURELY_NOT),
+        ("pumping", "energy gained in a swing, smallest", min_pumped_energy, TRY_IT),
+        ("swing", "energy gained from rest to rest, smallest", min_energy_gain, SURELY_NOT),
     ):
         energy_gain, remedy = energy(swing, drive), ""
         if energy_gain <= 0.0:

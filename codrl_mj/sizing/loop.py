@@ -5,8 +5,8 @@ is (1 - e)/R/(z - e) with e = exp(-R*T/L), the PI controller is ((kp + ki*T)*z -
 the delay of a sample is 1/z. Source: Franklin, Powell, Workman, *Digital Control of Dynamic
 Systems*, ch. 4; the design is in `codrl_mj.actuators.sampled`. A `DCMotorActuator` integrates its
 winding by Euler's rule, T/L/(z - 1 + R*T/L), with the PID controller of
-`codrl_mj.actuators.current_loop`. Its sample rate is the number of substeps per mechanical step, so
-functions take that step [s].
+`codrl_mj.actuators.current_loop`. Its sample rate is substeps/timestep, so the functions take the
+mechanical timestep [s].
 """
 
 import dataclasses
@@ -28,14 +28,14 @@ RATES = (10e3, 20e3, 40e3)
 
 
 def is_closed(actuator: CurrentLoopActuator) -> bool:
-    """Return True if the loop is closed, by a nonzero gain on the error."""
+    """Return True if the loop is closed, which means that a gain on the error is not 0."""
     return isinstance(actuator, Drive) or any(
         (actuator.controller.kp, actuator.controller.ki, actuator.controller.kd)
     )
 
 
 def gains(drive: Drive) -> tuple[float, float]:
-    """Return a drive's proportional [V/A] and integral gain [V/(A*s)], designed or explicit."""
+    """Return the proportional gain [V/A] and the integral gain [V/(A*s)] of a drive's loop."""
     loop = drive.controller
     if loop.kp != 0.0 or loop.ki != 0.0:
         return loop.kp, loop.ki
@@ -57,7 +57,7 @@ def undersampling_warning(drive: Drive) -> str:
 
 
 class _Sampled(NamedTuple):
-    """Current loop in z."""
+    """Discrete transfer functions of a current loop, with its gains and limits."""
 
     rate: float  # sample rate [Hz]
     gains: tuple[float, float]  # proportional [V/A], integral [V/(A*s)]
@@ -82,7 +82,7 @@ def _sampled(actuator: CurrentLoopActuator, timestep: float | None) -> _Sampled:
                 2.0 * math.pi * (actuator.controller.bandwidth or DEFAULT_BANDWIDTH * rate)
             )
         decay = math.exp(-resistance * time / inductance)
-        input_gain = -math.expm1(-resistance * time / inductance) / resistance  # [A/V], of a sample
+        input_gain = -math.expm1(-resistance * time / inductance) / resistance  # [A/V] in a sample
         numerator = np.array([input_gain * (kp + ki * time), -input_gain * kp])
         delay = [1.0, 0.0] if actuator.controller.delayed else [1.0]
         denominator = np.polymul(np.polymul([1.0, -decay], [1.0, -1.0]), delay)
@@ -178,7 +178,7 @@ class Response(NamedTuple):
         return max(1.0 - float(self.current[self._last :].min()) / float(self.reference[-1]), 0.0)
 
     def settling_time(self, band: float = 0.02) -> float:
-        """Return the time [s] until the current stays in the band after the last step, or NaN."""
+        """Return the time [s] from the last step until the current stays in a band, or NaN."""
         outside = np.flatnonzero(
             np.abs(self.current[self._last :] / self.reference[-1] - 1.0) > band
         )
@@ -196,13 +196,13 @@ def simulate_loop(
     speed: float = 0.0,
     timestep: float | None = None,
 ) -> Response:
-    """Simulate a loop sample by sample with its `advance`, starting from a settled current of 0.
+    """Simulate a loop sample by sample with the actuator's `advance`, from a settled current of 0.
 
     Args:
-        actuator: a drive; or a `DCMotorActuator`, with an exact sensor and a speed of 0.
+        actuator: drive, or `DCMotorActuator` at a speed of 0, whose sensor is made exact.
         references: reference current of each sample [A], shape (n,).
         speed: constant speed of the rotor [rad/s].
-        timestep: mechanical step of a `DCMotorActuator` [s]; see the module.
+        timestep: mechanical timestep of a `DCMotorActuator` [s]; not used for a drive.
     """
     time = 1.0 / _sampled(actuator, timestep).rate
     state_type: Any = actuator.State
@@ -251,7 +251,7 @@ def small_step_response(actuator: CurrentLoopActuator, timestep: float | None = 
 
 @dataclasses.dataclass(frozen=True)
 class LoopDesign:
-    """Figures of a current loop; NaN for a crossing above half the sample rate."""
+    """Figures of merit of a current loop; NaN for a crossing above half the sample rate."""
 
     sample_rate: float
     """Sample rate [Hz]."""
@@ -290,9 +290,9 @@ def design(actuator: CurrentLoopActuator, timestep: float | None = None) -> Loop
         closed_loop(actuator, timestep),
         small_step_response(actuator, timestep),
     )
-    # The margins are searched on the unit circle, which is exact also for slow loops and the pole
-    # at z = 1. python-control uses roots of polynomials, which are not. At half the sample rate, z
-    # = -1, the loop is real: without an earlier crossing, the gain margin is defined there.
+    # A search on the unit circle is accurate even for slow loops and the pole at z = 1, unlike the
+    # polynomial roots that python-control uses. At half the sample rate (z = -1) the loop is real:
+    # without an earlier crossing, the gain margin is defined there.
     phase_crossover_ = _first_below(lambda z: -open_transfer(z).imag, loop.rate)
     phase_crossover_ = 0.5 * loop.rate if math.isnan(phase_crossover_) else phase_crossover_
     crossover = _first_below(lambda z: abs(open_transfer(z)) - 1.0, loop.rate)
@@ -314,7 +314,7 @@ def design(actuator: CurrentLoopActuator, timestep: float | None = None) -> Loop
 def designs(drive: Drive) -> dict[tuple[float, bool], LoopDesign | str]:
     """Return (rate, delayed) -> `design` at the drive's rate and at `RATES`, or an error as text.
 
-    The bandwidth is kept, or the gains if they are explicit.
+    All designs have the drive's bandwidth, or its gains if they are explicit.
     """
     designs_by_rate: dict[tuple[float, bool], LoopDesign | str] = {}
     for rate in sorted({drive.controller.sample_rate, *RATES}):
@@ -345,18 +345,18 @@ def _first_below(function: Any, rate: float) -> float:
     return float(brentq(lambda frequency: float(function(_point(frequency, rate))), *bracket))
 
 
-# -- out of saturation -----------------------------------------------------------------------------
+# -- recovery from saturation ----------------------------------------------------------------------
 
 ANTI_WINDUPS = ("back_calculation", "clamping", "none")
 """Kinds of anti-windup, by their names in `SampledLoop.anti_windup`."""
-_UNREACHABLE = 0.02
+_SATURATED_DURATION = 0.02
 """Duration of the unreachable reference [s]."""
-_AFTER = 0.1
+_RECOVERY_DURATION = 0.1
 """Duration of the recovery [s]."""
 
 
 class StepResponses(NamedTuple):
-    """Step responses of a drive."""
+    """Small step response of a drive, and its recovery from saturation."""
 
     small: Response
     """Response to a current that does not saturate, at standstill."""
@@ -365,9 +365,9 @@ class StepResponses(NamedTuple):
     unreachable.
     """
     unreachable: float
-    """Reference current that cannot be reached, for 20 ms [A]."""
+    """Reference current that the drive cannot reach [A]; it lasts 20 ms."""
     reachable: float
-    """Reference current after that [A]."""
+    """Reference current after the unreachable one [A]."""
     recoveries: dict[str, Response]
     """Kind of anti-windup -> response to the unreachable and then the reachable current."""
 
@@ -385,10 +385,10 @@ def step_responses(drive: Drive) -> StepResponses:
     loop = drive.controller
     if loop.sample_rate < 1e3:
         raise ValueError(
-            f"SampledLoop.sample_rate = {loop.sample_rate:g}: must be >= 1000 Hz, to see a step;"
-            " raise it"
+            f"SampledLoop.sample_rate = {loop.sample_rate:g}: must be >= 1000 Hz to resolve a"
+            " step; raise it"
         )
-    samples = (_UNREACHABLE + _AFTER) * loop.sample_rate
+    samples = (_SATURATED_DURATION + _RECOVERY_DURATION) * loop.sample_rate
     label = f"SampledLoop.sample_rate = {loop.sample_rate:g}: {samples:,.0f} samples of a step"
     check_memory(_SAMPLE_SIZE * samples, label, "lower it")
     drive.check(1.0 / loop.sample_rate)
@@ -398,7 +398,7 @@ def step_responses(drive: Drive) -> StepResponses:
         unreachable = min(0.9 * voltage / motor.resistance, loop.max_current)
         speed = (voltage - motor.resistance * unreachable / 1.8) / motor.back_emf_constant
     reachable = 0.4 / 1.8 * unreachable
-    spans = (_UNREACHABLE, unreachable), (_AFTER, reachable)
+    spans = (_SATURATED_DURATION, unreachable), (_RECOVERY_DURATION, reachable)
     references = np.concatenate(
         [np.full(round(time * loop.sample_rate), current) for time, current in spans]
     )

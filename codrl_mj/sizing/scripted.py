@@ -12,7 +12,7 @@ Law = Callable[[np.ndarray], np.ndarray]
 """Function (states (N, n)) -> forces [N] or torques [N*m], shape (N,), before clipping."""
 
 HOLD_ANGLE, HOLD_SPEED = 0.5, 3.0
-"""Limits around upright [rad, rad/s]: inside the pendulum is held, outside it is swung up."""
+"""Limits around upright [rad, rad/s] within which the pendulum is held instead of swung up."""
 
 
 def swing_up_and_hold(states: np.ndarray) -> np.ndarray:
@@ -22,8 +22,8 @@ def swing_up_and_hold(states: np.ndarray) -> np.ndarray:
     omega^2/6 + 5 (cos(theta) - 1) J.
     """
     angle, speed = (states[:, 0] + np.pi) % (2 * np.pi) - np.pi, states[:, 1]
-    missing = 5.0 * (1.0 - np.cos(angle)) - speed**2 / 6.0
-    pump = np.inf * np.sign(missing) * np.where(speed < 0.0, -1.0, 1.0)
+    missing_energy = 5.0 * (1.0 - np.cos(angle)) - speed**2 / 6.0
+    pump = np.inf * np.sign(missing_energy) * np.where(speed < 0.0, -1.0, 1.0)
     near_upright = (np.abs(angle) < HOLD_ANGLE) & (np.abs(speed) < HOLD_SPEED)
     return np.where(near_upright, -12.0 * angle - 4.0 * speed, np.nan_to_num(pump))
 
@@ -37,8 +37,8 @@ def swing_up_and_balance(states: np.ndarray) -> np.ndarray:
     """
     arm, rod, arm_speed, rod_speed = states.T
     rod = (rod + np.pi) % (2 * np.pi) - np.pi
-    missing = 1.0 - np.cos(rod) - 6.66e-5 / 0.0152 * rod_speed**2
-    pump = 0.034 * np.clip(10.0 * missing, -1.0, 1.0) * np.sign(rod_speed * np.cos(rod))
+    missing_energy = 1.0 - np.cos(rod) - 6.66e-5 / 0.0152 * rod_speed**2
+    pump = 0.034 * np.clip(10.0 * missing_energy, -1.0, 1.0) * np.sign(rod_speed * np.cos(rod))
     near_upright = (np.abs(rod) < 0.4) & (np.abs(rod_speed) < 8.0)
     hold = 0.014 * arm - 0.17 * rod + 0.0055 * arm_speed - 0.014 * rod_speed
     return np.where(near_upright, hold, pump - 0.03 * arm - 0.002 * arm_speed)

@@ -13,8 +13,9 @@ from codrl_mj.sizing.abilities import highest_current
 _ANGLES = np.linspace(-np.pi, np.pi, 1001)
 _STEP = _ANGLES[1] - _ANGLES[0]
 _LEVELS = np.linspace(0.02, 1.0, 50)
-"""Energies of swings [energy at the top]."""
+"""Energies of swings, relative to the energy at the top."""
 _MAX_VOLTAGE = 1e4
+"""Largest supply [V] in the search of `min_supply_voltage`."""
 
 
 class Swing(NamedTuple):
@@ -25,7 +26,7 @@ class Swing(NamedTuple):
     gravity: float
     """Largest torque G of gravity: m*g times the distance from hinge to center of mass [N*m]."""
     largest: float
-    """Largest torque command [N*m]."""
+    """Largest torque [N*m] that a policy can command."""
     damping: float = 0.0
     """Damping of the hinge [N*m*s/rad]."""
     friction: float = 0.0
@@ -42,8 +43,8 @@ class Swing(NamedTuple):
     def push(self, speed: Any, drive: Drive) -> Any:
         """Return the largest net torque [N*m] in the direction of motion.
 
-        It is min(tau_max, N eta kT min((V - N kE omega)/R, i_max)) minus friction, with R of
-        winding and supply. It is negative beyond the no-load speed, where the current brakes.
+        It is min(tau_max, N eta kT min((V - N kE omega)/R, i_max)) minus friction, where R is the
+        resistance of winding and supply. Beyond the no-load speed it is negative: the motor brakes.
         """
         motor, ratio, added = drive.motor, 1.0 / drive.arm_radius, drive.additions
         back_emf = ratio * motor.back_emf_constant * np.asarray(speed)
@@ -61,8 +62,8 @@ def min_pumped_energy(swing: Swing, drive: Drive) -> float:
     """Return an estimate of the smallest energy [J] that full force adds in a swing.
 
     It is the minimum over E of the integral of push(omega) over theta, with omega = sqrt(2 (E -
-    potential(theta)) / I): the energy is treated as constant during a swing. Infinite if the torque
-    lifts the pendulum without a swing.
+    potential(theta)) / I): the energy is treated as constant during a swing. It is infinite if the
+    torque lifts the pendulum without a swing.
     """
     if swing.push(0.0, drive) >= swing.gravity:
         return math.inf
@@ -107,12 +108,12 @@ def min_energy_gain(swing: Swing, drive: Drive) -> float:
 def min_supply_voltage(
     swing: Swing, drive: Drive, energy: Callable[[Swing, Drive], float]
 ) -> float:
-    """Return the lowest supply [V] with a positive energy; infinite if there is none.
+    """Return the lowest supply [V] at which `energy` is positive; infinite if there is none.
 
     `energy` is `min_pumped_energy` or `min_energy_gain`.
     """
 
-    def enough(voltage: float) -> bool:
+    def suffices(voltage: float) -> bool:
         return (
             energy(
                 swing, dataclasses.replace(drive, supply=Supply(voltage, drive.supply_resistance))
@@ -121,11 +122,11 @@ def min_supply_voltage(
         )
 
     low, high = 0.0, 1.0
-    while not enough(high):
+    while not suffices(high):
         low, high = high, 2.0 * high
         if high > _MAX_VOLTAGE:
             return math.inf
     while high - low > 1e-3 * high:
         middle = (low + high) / 2.0
-        low, high = (low, middle) if enough(middle) else (middle, high)
+        low, high = (low, middle) if suffices(middle) else (middle, high)
     return high

@@ -1,4 +1,4 @@
-"""Studies: arms trained with many seeds, trials, judged questions and a result page."""
+"""Studies: arms trained with many seeds, trials of their policies, and judged questions."""
 
 from codrl_mj.study.inference import (
     Stratum,

@@ -3,9 +3,10 @@
 The bench converts the actuator into a severity on each axis of the study. The loss of policies
 trained on ideal forces is interpolated, policy by policy, between the severities that the study
 tested, and the losses of all axes are added. For policies trained on random actuators or through
-the actuator, the study gives an upper bound if it tested severities at least as large on every
-axis, and a lower bound if it tested severities at most as large. A `Measurement` needs none of
-these assumptions: it trains and tests new policies, in any environment, and applies the same rule.
+the actuator, a test of the study at severities at least as large on every axis gives an upper
+bound, and a test at severities at most as large a lower bound. A `Measurement` needs none of these
+assumptions: it trains and tests new policies, in any environment, and applies the same rule
+(`decide`).
 """
 
 import dataclasses
@@ -35,13 +36,13 @@ IDEAL, COMMAND, LOOP = "train on ideal", "command more", "design the loop"
 RANDOMIZE, THROUGH = "randomise", "train through it"
 BUY, MEASURE = "buy another", "measure it"
 RANDOM = ("generic", "random")
-"""Arms of the two studies trained on random actuators; the two differ in their ranges."""
+"""Arms trained on random actuators, one of each study; their ranges differ."""
 OPTIONS = (IDEAL, COMMAND, LOOP, RANDOMIZE, THROUGH)
 """Options for an actuator, in order of effort. The other two verdicts are `BUY` and `MEASURE`."""
 
 
 class LossBounds(NamedTuple):
-    """Upper and lower bound on the loss of policies under one option."""
+    """Upper and lower bound on the loss of policies with one option."""
 
     upper: Outcome | None
     """Largest possible loss; None if unknown."""
@@ -66,15 +67,15 @@ def decide(options: Mapping[str, LossBounds]) -> str:
     1. The first of `OPTIONS` whose loss is negligible.
     2. Otherwise consider the options that are certainly better than training on ideal forces, by
        more than `MARGIN`, and return the first whose mean is within `MARGIN` of the best of them.
-    3. Otherwise `BUY` if every option is certainly harmful and has a known upper bound (the first
-       option needs none).
+    3. Otherwise `BUY` if every option is certainly harmful and all options except training on ideal
+       forces have a known upper bound.
     4. Otherwise `MEASURE`.
     """
     known_options = {name: options[name] for name in OPTIONS if name in options}
     for name, option in known_options.items():
         if option.upper is not None and option.upper.is_negligible:
             return name
-    untrained = known_options[IDEAL].lower
+    ideal_trained = known_options[IDEAL].lower
     upper = {
         name: option.upper.loss
         for name, option in known_options.items()
@@ -83,7 +84,7 @@ def decide(options: Mapping[str, LossBounds]) -> str:
     better = [
         name
         for name in upper
-        if untrained is not None and upper[name].high < untrained.loss.low - MARGIN
+        if ideal_trained is not None and upper[name].high < ideal_trained.loss.low - MARGIN
     ]
     if better:
         best = min(upper[name].mean for name in better)
@@ -124,7 +125,12 @@ def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
     losses = predict_losses(evidence, task, severities(delivery, task))
     if len(losses) < len(AXES):
         return Advice(
-            task, delivery, (), {}, None, "the study has no results of this task here: measure it"
+            task,
+            delivery,
+            (),
+            {},
+            None,
+            "no results of the study are available for this task: measure it",
         )
     redesigned, boosted = (
         redesign_loop(actuator, task),
@@ -139,8 +145,7 @@ def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
             options[name] = _bounds_of_losses(
                 predict_losses(evidence, task, severities(improved, task))
             )
-    # The study has no axis for excess force or for an offset, so that no loss is predicted for
-    # them.
+    # The study has no axis for excess force or for an offset, so that it predicts no loss for them.
     untested = ""
     if max(delivery.at_rest, delivery.at_speed) > 1.0 + MARGIN:
         untested = "it delivers more force than commanded"
@@ -178,12 +183,13 @@ def option_bounds(
 ) -> dict[str, LossBounds]:
     """Return the study's loss bounds by option, for given severities on all axes.
 
-    A test at severities at least as large on every axis gives an upper bound. If a test has less of
-    an axis than requested, the loss of ideal-trained policies on that axis is added to its result.
-    A test at severities at most as large on every axis gives a lower bound.
+    A test at severities at least as large on every axis gives an upper bound. If the severity of a
+    test is smaller on some axis, it also gives an upper bound after the loss of ideal-trained
+    policies on that axis is added. A test at severities at most as large on every axis gives a
+    lower bound.
 
     Args:
-        evidence: the study's rows.
+        evidence: scores of the studies.
         task: task name.
         requested: severity by axis.
         tests: result of `tested_points`, if already computed.
@@ -199,7 +205,8 @@ def option_bounds(
                 for axis, severity in requested.items()
                 if severity > 1.005 * tested.get(axis, 0.0) + 1e-9
             }
-            # Axes on which the test had less than requested are added as for untrained policies.
+            # On axes where the test was milder than requested, the loss of ideal-trained policies
+            # is added.
             extra = predict_losses(evidence, task, exceeding)
             if not any(loss.beyond for loss in extra):
                 clipped = (
@@ -258,8 +265,8 @@ def tested_points(evidence: Evidence, task: str) -> TestedPoints:
 
 
 def _reason(verdict: str, options: Mapping[str, LossBounds], delivery: Delivery) -> str:
-    untrained = options[IDEAL]
-    text = f"policies trained on ideal forces lose {describe(untrained)}"
+    ideal_trained = options[IDEAL]
+    text = f"policies trained on ideal forces lose {describe(ideal_trained)}"
     if verdict in (IDEAL, BUY):
         alternatives = ", ".join(
             f"{name} {describe(option)}" for name, option in options.items() if name != IDEAL
@@ -304,14 +311,14 @@ RANDOM_EPISODES = 100
 
 
 class Measurement(NamedTuple):
-    """Trainings and tests that measure the loss on an actuator for each option."""
+    """Trainings and tests that measure the loss on an actuator with each option."""
 
     grid: Grid
     """All trainings and tests."""
     baseline: Trial
     """Policies trained and tested on ideal forces."""
     options: Mapping[str, Trial]
-    """Option -> test of its policies, on the actuator or on its motor with a designed loop."""
+    """Option -> test of its policies, on the actuator or on the same motor with a designed loop."""
 
     def loss_bounds(self, collected: Collected) -> dict[str, LossBounds]:
         """Return the loss by option, for `decide`; the task's span is treated as exact.
@@ -359,7 +366,7 @@ def plan_measurement(
         actuator: anything that `EnvConfig.actuator` accepts.
         subject: a task, the Gymnasium id of a third-party environment, or a run folder, whose
             environment, agent and training budget are reused.
-        seeds: training runs of each kind, at least 2.
+        seeds: number of training runs for each option, at least 2.
         root: folder of the run folders.
         episodes: test episodes of each policy.
         trust: whether to import the modules that a run folder names, which executes them.
@@ -370,12 +377,12 @@ def plan_measurement(
     if seeds < 2:
         raise ValueError(f"seeds = {seeds}: an interval needs at least 2")
     base = _ideal_arm(subject, trust)
-    # The ideal environment is reused as it is: policies are judged by the reward of their training.
+    # The ideal environment is reused unchanged, so that policies are judged by their own reward.
     ideal_env = base.config.env
     env_on_actuator = dataclasses.replace(ideal_env, actuator=actuator)
     if all(motor_actuator == IDEAL_ACTUATOR for motor_actuator in env_on_actuator.actuators):
         raise ValueError(
-            "actuator = 'ideal': training through it is training on ideal forces: name another"
+            "actuator = 'ideal': there is no loss to measure on ideal forces; name another actuator"
         )
     env = dataclasses.replace(base.config.env, actuator=actuator)
     through_arm = Arm(

@@ -1,4 +1,4 @@
-"""Axes of the study: one actuator effect each, at a severity, and arms trained and tested on them.
+"""Axes of the study, each one effect of an actuator, and arms trained and tested on them.
 
 A severity is a dimensionless number with the same meaning on every task: times in policy steps,
 forces in shares of the task's largest force, supplies in shares of the voltage that the task needs.
@@ -62,7 +62,7 @@ REFERENCE_SPEEDS: Mapping[str, float] = {
 
 
 def study_env(task: str, actuator: Any = IDEAL, **fields: Any) -> EnvConfig:
-    """Return a task's environment for the study, with at least ten integration steps a policy step.
+    """Return a task's environment for the study, with >= 10 integration steps per policy step.
 
     Ideal and real actuators share the integration step, so that only the actuator differs.
     """
@@ -109,7 +109,7 @@ def motor_constant(task: str) -> float:
 
 
 def needed_voltage(task: str) -> float:
-    """Return that motor's voltage [V] at the largest force and reference speed: 2*sqrt(F*w)."""
+    """Return the voltage [V] of a motor with `motor_constant`, at F and w: 2*sqrt(F*w)."""
     return 2.0 * math.sqrt(find_task(task).max_force * REFERENCE_SPEEDS[task])
 
 
@@ -163,14 +163,15 @@ REAL: Mapping[str, Mapping[str, Any]] = {
         }
     },
 }
-"""Task -> name of arm and test -> drive: a motor that `codrl-mj motor choose` judges `try it`,
-because some bound is not met (the cars have none), and the paper's motor with two current loops.
+"""Task -> name of arm and test -> drive. `marginal motor` is a motor that `codrl-mj motor choose`
+judges `try it`, because it misses a bound; there is none for Mountain Car. The others are the
+paper's motor with two current loops.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """One effect of an actuator on a command."""
+    """One effect of an actuator on a command, with its tested severities."""
 
     title: str
     """Title in tables and figures."""

@@ -16,27 +16,27 @@ from codrl_mj.tasks import find_task
 BLOCKED_INERTIA = 1e12
 """Inertia [kg*m^2] so large that the hinge stays at its speed."""
 HORIZON_STEPS = 20.0
-"""Duration of a bench measurement in policy steps; a force that comes later does not count."""
+"""Duration of a bench measurement in policy steps; later forces are ignored."""
 
 
 def make_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., np.ndarray]:
     """Build a hinge with an actuator and return a function that runs it.
 
     Args:
-        actuator: the actuator that drives the hinge.
+        actuator: actuator that drives the hinge.
         timestep: integration step [s].
         inertia: inertia of the load [kg*m^2].
     """
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.compiler.boundmass = timestep, 0.0
-    # The solver's tolerance is relative to the inertia: with a huge one the solver would stop
+    # The solver's tolerance is relative to the inertia: with a huge inertia the solver would stop
     # before it has resolved the friction.
     spec.option.tolerance = 0.0
     body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
     body.add_joint(name="hinge", axis=[0.0, 0.0, 1.0])
     spec.add_actuator(target="hinge", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
     model = add_motors(spec, {"hinge": actuator}).compile()
-    data, moved = mujoco.MjData(model), inertia + actuator.additions.armature
+    data, total_inertia = mujoco.MjData(model), inertia + actuator.additions.armature
 
     def run(torque: float, duration: float, speed: float = 0.0) -> np.ndarray:
         """Command a torque [N*m] for a `duration` [s], starting at a speed of the joint [rad/s].
@@ -50,7 +50,7 @@ def make_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., 
         rows = np.empty((max(round(duration / timestep), 1), 3))
         for row in rows:
             mujoco.mj_step(model, data)
-            row[:] = data.qfrc_actuator[0], data.qacc[0] * moved, data.qvel[0]
+            row[:] = data.qfrc_actuator[0], data.qacc[0] * total_inertia, data.qvel[0]
         return rows
 
     return run
@@ -76,12 +76,12 @@ class Delivery(NamedTuple):
     at_speed: float
     """Final force while driving at the reference speed [largest force]."""
     friction: float
-    """Braking force at zero command [largest force]: the larger of the total at a twentieth of the
-    reference speed, and of the mechanical losses at the reference speed, which exclude the
-    back-EMF.
+    """Braking force at zero command [largest force]. It is the larger of two values: the total
+    braking force at a twentieth of the reference speed, and the mechanical losses, without the
+    back-EMF, at the reference speed.
     """
     noise: float
-    """Standard deviation of the force [largest force] from one integration step to the next."""
+    """Standard deviation of the force [largest force] over the integration steps."""
     unasked: float
     """Magnitude of the mean force at rest and zero command [largest force]."""
 
@@ -92,7 +92,7 @@ def measure_delivery(
     """Measure the response of an actuator to a command.
 
     Args:
-        actuator: the actuator.
+        actuator: actuator to measure.
         timestep: integration step [s].
         step: policy step [s].
         force: largest command [N*m; N on a slide].
@@ -108,13 +108,16 @@ def measure_delivery(
 
     # The inertia is so large that friction hardly slows the hinge within the measurement.
     def braking(joint_speed: float) -> tuple[float, float]:
-        turned = _end(
+        rows = _end(
             make_bench(actuator, timestep, 1e4 * force * duration / joint_speed)(
                 0.0, duration, joint_speed
             )
         )
-        driven, moved, _ = np.mean(turned, axis=0)
-        return float(np.mean(_end(unasked)) - moved) / force, float(driven - moved) / force
+        motor_torque, net_torque, _ = np.mean(rows, axis=0)
+        return (
+            float(np.mean(_end(unasked)) - net_torque) / force,
+            float(motor_torque - net_torque) / force,
+        )
 
     # The area between the step response and its final value is the average residence time.
     torques = delivered_torque(0.0)
@@ -147,8 +150,8 @@ def measure_on_task(actuator: Any, task: str, share: float = 1.0) -> Delivery:
     check_selection("task", [task], REFERENCE_SPEEDS)
     if actuator.MOTION:
         raise ValueError(
-            f"actuator: a {actuator.family} is asked for motion, not for forces: name one of"
-            " another family"
+            f"actuator: a {actuator.family} is commanded a motion, not a force: name an"
+            " actuator of another family"
         )
     definition = find_task(task)
     return measure_delivery(
@@ -161,7 +164,7 @@ def measure_on_task(actuator: Any, task: str, share: float = 1.0) -> Delivery:
 
 
 def severities(delivery: Delivery, task: str) -> dict[str, float]:
-    """Return the severity on each axis that has the same effect as the measured actuator.
+    """Return the severity on each axis that corresponds to the measured actuator.
 
     A gain g (weakness 1 - g) and a supply that lacks a share d leave g*min(1, 2*(1 - d)) of the
     largest force at rest and g*(1 - 2*d) at the reference speed (`axes.supply`). Both equations are
@@ -189,10 +192,10 @@ def severities(delivery: Delivery, task: str) -> dict[str, float]:
 
 
 def with_larger_command(actuator: Any, task: str, delivery: Delivery) -> Delivery | None:
-    """Return the response to commands scaled up to make up for the force lost at rest.
+    """Return the response to commands that are scaled up by the force lost at rest.
 
-    None if the loss is below 2 %, or if the loop can be redesigned: then the missing force is late,
-    not lost.
+    None if at most 2 % or at least 90 % of the force is lost, or if the loop can be redesigned:
+    then the missing force comes late and is not lost.
     """
     if not 0.1 < delivery.at_rest < 0.98 or redesign_loop(actuator, task) is not None:
         return None
@@ -206,7 +209,7 @@ def with_larger_command(actuator: Any, task: str, delivery: Delivery) -> Deliver
 def redesign_loop(actuator: Any, task: str) -> Drive | None:
     """Return the same motor and supply with a designed loop; None if that changes nothing."""
     if isinstance(actuator, DCMotorActuator):
-        # No loop corrects an error of the current sensor.
+        # No design of the loop corrects an error of the current sensor.
         sensor_error = actuator.controller.current_noise or actuator.controller.current_bias
         return None if sensor_error else drive_with_designed_loop(actuator, task)
     if isinstance(actuator, Drive):

@@ -19,13 +19,13 @@ MAX_FAILED_SHARE = 0.1
 """Largest share of failing policies, and of lost success, for a loss to count as negligible."""
 _PACKAGE = Path(__file__).parents[1]
 EVIDENCE = (_PACKAGE / "_assets" / "study", _PACKAGE.parent / "docs" / "results")
-"""Parents of the studies' folders of rows: in a wheel, and in a checkout."""
+"""Folders that contain the published rows of each study: in a wheel, and in a checkout."""
 STUDIES = ("actuators", "insurance")
 _COLUMNS = ("task", "trained", "tested", "seed", "score", "success")
 
 
 class Outcome(NamedTuple):
-    """Loss of each policy of one kind, relative to policies on ideal forces."""
+    """Loss of each policy of an arm in one test, relative to policies on ideal forces."""
 
     lost: np.ndarray
     """Lost share of the task's span, shape (policies,)."""
@@ -127,7 +127,7 @@ class Evidence:
 
     @classmethod
     def read(cls, *files: Path) -> "Evidence":
-        """Read files of rows; without arguments, those of the checkout or the wheel, if any."""
+        """Read files of rows; without arguments, the published rows of checkout or wheel."""
         published = [
             path
             for folder in EVIDENCE
@@ -232,8 +232,8 @@ class Evidence:
         if not available:
             return {}
         count = min(len(outcome.lost) for outcome in available.values())
-        # Losses are interpolated policy by policy, so every severity needs the same policies: seeds
-        # that some test lacks are cut off.
+        # Losses are interpolated policy by policy, so that every severity needs the same policies.
+        # The shortest test determines how many are used.
         cut = {
             severity: Outcome(outcome.lost[:count], outcome.missed[:count])
             for severity, outcome in available.items()

@@ -71,7 +71,7 @@ def cell_folder(root: Path, config: TrainConfig) -> Path:
 
 
 def read_failure(cell: Path | Deployment) -> str | None:
-    """Return the error of a cell's last attempt (run folder or test) in a line; None if none."""
+    """Return the error of the last attempt of a cell (run folder or test), in one line, or None."""
     record = failure_record(cell)
     return str(read_json(record, "record of a failure")["error"]) if record.is_file() else None
 
@@ -93,7 +93,7 @@ def train_runs(
 
     Args:
         runs: run folder -> configuration.
-        workers: processes that compute.
+        workers: settings of the worker processes.
         on_run: called with a folder when its training has finished or failed; runs that were
             finished before come first.
         **options: further arguments of `training.train`.
@@ -118,7 +118,7 @@ def deploy_cells(
 
     Args:
         deployments: name of the test -> test.
-        workers: processes that compute.
+        workers: settings of the worker processes.
         on_cell: called with a name when its test has finished or failed; tests that were finished
             before come first.
     """
@@ -157,7 +157,7 @@ def _attempt(
     function: Callable[..., None],
     *arguments: Any,
 ) -> tuple[Any, str | None]:
-    """Call a function; return the name and its error in a line, which a file records."""
+    """Call a function; return the name and the error in one line, which is also recorded."""
     record = failure_record(cell)
     try:
         function(*arguments)

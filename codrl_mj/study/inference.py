@@ -15,7 +15,7 @@ import numpy as np
 from codrl_mj.evaluation.measures import Interval
 
 RELABELINGS = 50_000
-"""Random relabelings of a permutation test: the smallest possible p is 2e-5."""
+"""Random relabelings of a permutation test; the smallest possible p-value is 2e-5."""
 
 
 class Stratum(NamedTuple):
@@ -60,7 +60,7 @@ def effect(strata: Sequence[Stratum], confidence: float = 0.95) -> Interval:
 def permutation_p(
     strata: Sequence[Stratum], min_difference: float = 0.0, two_sided: bool = True
 ) -> float:
-    """Return the p of no difference, by a permutation test of the mean difference.
+    """Return the p-value of no difference, from a permutation test of the mean difference.
 
     Labels are exchanged within each stratum: among its runs, or within each pair of a paired
     stratum. The observed labels count as one of the relabelings. The level is exact if both groups
@@ -83,9 +83,11 @@ def permutation_p(
         pooled, n = np.concatenate([treatment, control]), len(treatment)
         sums = _random_labels(n, len(control), number) @ pooled
         totals += sums / n - (pooled.sum() - sums) / len(control)
-    # Summation in another order changes the last bits, so ties are compared with a slack.
-    slack = 1e-9 * max(1.0, abs(observed))
-    extreme = np.abs(totals) >= abs(observed) - slack if two_sided else totals >= observed - slack
+    # Summation in another order changes the last bits, so that ties need a tolerance.
+    tolerance = 1e-9 * max(1.0, abs(observed))
+    extreme = (
+        np.abs(totals) >= abs(observed) - tolerance if two_sided else totals >= observed - tolerance
+    )
     return (1 + int(extreme.sum())) / (1 + RELABELINGS)
 
 
@@ -105,7 +107,7 @@ def _random_labels(n: int, m: int, stratum: int) -> np.ndarray:
 
 
 def equivalence_p(strata: Sequence[Stratum], margin: float) -> float:
-    """Return the p of a difference of at least the margin, by two one-sided tests.
+    """Return the p-value of a difference of at least the margin, from two one-sided tests.
 
     Args:
         strata: at least one.
@@ -116,7 +118,7 @@ def equivalence_p(strata: Sequence[Stratum], margin: float) -> float:
 
 
 def holm(p: Sequence[float]) -> np.ndarray:
-    """Return p corrected by Holm, which bounds the probability of any false positive.
+    """Return p-values corrected by Holm, which bounds the probability of any false positive.
 
     Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of
     Statistics 6 (1979).
@@ -130,14 +132,14 @@ def holm(p: Sequence[float]) -> np.ndarray:
 
 
 def benjamini_hochberg(p: Sequence[float]) -> np.ndarray:
-    """Return p corrected by Benjamini and Hochberg, which bounds the share of false discoveries."""
+    """Return p-values corrected by Benjamini and Hochberg, which bounds false discoveries."""
     from scipy.stats import false_discovery_control
 
     return np.asarray(false_discovery_control(p)) if len(p) else np.array([])
 
 
 def power(runs: int, difference: float, level: float = 0.05) -> float:
-    """Return the power of a two-sided t-test of two groups, by the noncentral t distribution.
+    """Return the power of a two-sided t-test of two groups, from the noncentral t distribution.
 
     Args:
         runs: runs in each group, >= 2.
@@ -154,7 +156,7 @@ def power(runs: int, difference: float, level: float = 0.05) -> float:
 
 
 def detectable_difference(runs: int, level: float = 0.05, probability: float = 0.8) -> float:
-    """Return the smallest difference [standard deviations of a run] detected with a probability."""
+    """Return the smallest detectable difference [standard deviations of a run] at a given power."""
     from scipy.optimize import brentq
 
     return float(
@@ -165,7 +167,7 @@ def detectable_difference(runs: int, level: float = 0.05, probability: float = 0
 def runs_needed(
     difference: float, level: float = 0.05, probability: float = 0.8, max_runs: int = 10_000
 ) -> int | None:
-    """Return the runs per group that detect a difference; None if more than `max_runs`.
+    """Return the number of runs per group that detect a difference; None above `max_runs`.
 
     The difference is in standard deviations of a run.
     """

@@ -38,8 +38,8 @@ def read_conclusions(page: Path) -> str:
     """Return a page's hand-written conclusions, or a notice that they are missing.
 
     Args:
-        page: the page; the conclusions of `actuators.md` are in `actuators_conclusions.md` beside
-            it. No program writes that file.
+        page: path of the page. The conclusions of `actuators.md` are in the hand-written file
+            `actuators_conclusions.md` beside it.
     """
     file = page.with_name(f"{page.stem}_conclusions.md")
     if file.is_file():
@@ -63,8 +63,9 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write a CSV table atomically.
 
     Args:
-        path: the file.
-        rows: column name -> value; the first row defines the columns. NaN and None become empty.
+        path: path of the file.
+        rows: rows, as column name -> value; the first row defines the columns. NaN and None become
+            empty.
     """
 
     def to_cell(value: Any) -> Any:

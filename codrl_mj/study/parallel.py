@@ -18,14 +18,14 @@ from codrl_mj.training.run import collecting_signals
 
 @dataclasses.dataclass(frozen=True)
 class Workers(Checked):
-    """Settings of the processes that compute.
+    """Settings of the worker processes.
 
     Raises:
         ValueError: unknown backend, or an impossible number of jobs.
     """
 
     jobs: int = -1
-    """Number of parallel calls, >= 1; -1 for one on each CPU (of the cluster)."""
+    """Number of parallel calls, >= 1; -1 for one on each CPU of this machine or of the cluster."""
     backend: Literal["local", "ray"] = choice("local", "local", "ray")
     """`local`: processes of this machine; `ray`: a Ray cluster with a shared file system."""
     address: str | None = None
@@ -52,7 +52,7 @@ class Workers(Checked):
 def compute(
     function: Callable[..., Any], work: Iterable[tuple[Any, ...]], workers: Workers
 ) -> Iterator[Any]:
-    """Yield the results of calls in the order of completion; with Ray, after the last has finished.
+    """Yield the results of calls as they complete; with Ray, after all of them have finished.
 
     After Ctrl-C no further call starts, trainings write their checkpoints, and other calls run to
     their end; a second Ctrl-C stops at once. An exception in a call aborts the others. The worker
@@ -61,7 +61,7 @@ def compute(
     Args:
         function: picklable function.
         work: picklable arguments of each call.
-        workers: processes that compute.
+        workers: settings of the worker processes.
 
     Raises:
         TrainingStoppedError: a signal asked to stop.

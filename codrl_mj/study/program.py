@@ -1,4 +1,4 @@
-"""Base class of a study's script: flags, progress, costs and the result page; docs/studies.md."""
+"""Base class of a study's script, with its flags, progress bars, costs and result page."""
 
 import abc
 import dataclasses
@@ -57,7 +57,7 @@ class Program(Checked, abc.ABC):
         """Write the page of all available results; return the files and the errors by name."""
 
     def publish(self) -> None:
-        """Write the available results after each completed seed: run folders may be temporary.
+        """Write the available results after each completed seed; run folders may be temporary.
 
         An error is only printed: the page is written again at the end, and raises it there.
         """
@@ -95,7 +95,7 @@ def main(kind: type[Program], arguments: Sequence[str] | None = None) -> int:
     """Run a study's script, with the fields of its program as flags.
 
     Args:
-        kind: the program.
+        kind: class of the program.
         arguments: command line without the script's name; None takes `sys.argv`.
 
     Returns:

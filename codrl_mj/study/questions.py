@@ -1,4 +1,4 @@
-"""Questions of a study: contrasts of trials, judged by intervals and corrected tests.
+"""Questions of a study: contrasts of trials, judged by intervals and corrected p-values.
 
 Scores are shares of each task's span, so that tasks can be pooled. Effects are differences of mean
 scores.
@@ -73,7 +73,7 @@ class Scores:
     def __init__(
         self, collected: Collected, floors: Mapping[str, float], ideal_trials: Iterable[Trial]
     ) -> None:
-        """Read the spans.
+        """Compute the span of each task.
 
         Args:
             collected: available results of the study.
@@ -99,7 +99,7 @@ class Scores:
         }
 
     def stratum(self, contrasts: Sequence[Contrast]) -> Stratum | None:
-        """Return each policy's mean over contrasts of one task; None with fewer than two per group.
+        """Return each seed's mean over contrasts of one task; None with fewer than two per group.
 
         Contrasts may share policies, so their scores are not independent; seeds are. Therefore each
         seed contributes one mean, over all contrasts, and only if it was tested in all of them.
@@ -133,9 +133,9 @@ class Verdict(NamedTuple):
     effect: Interval
     """Mean difference of scores [share of the span], with interval; NaN without contrasts."""
     p: float
-    """Uncorrected p of no difference, or of the margin (`equivalent`); NaN if not judged."""
+    """Uncorrected p-value of no difference (`equivalent`: of the margin); NaN if not judged."""
     corrected_p: float
-    """p after correction for the questions that are judged together."""
+    """p-value after correction for all questions that are judged together."""
 
     @property
     def outcome(self) -> Literal["yes", "no", "the other way", "open", "not judged"]:
@@ -154,8 +154,8 @@ class Verdict(NamedTuple):
     def seeds_to_close(self, questions: int) -> int | None:
         """Return the seeds per group that would decide an open question; None if too many.
 
-        They detect, with a probability of 80 %, the observed difference, or for equivalence the
-        distance to the margin in one of the two one-sided tests.
+        With a power of 80 % these seeds detect the observed difference or, for equivalence, its
+        distance from the margin in one of the two one-sided tests.
 
         Args:
             questions: number of questions that Holm corrects together; the strictest level is used.
@@ -201,10 +201,11 @@ class Verdict(NamedTuple):
 def judge(
     scores: Scores, questions: Sequence[Question], primary: bool = False, min_policies: int = 0
 ) -> list[Verdict]:
-    """Test questions and correct their p together.
+    """Test questions and correct their p-values together.
 
     A question with fewer than `min_policies` policies in a group is not judged, and enters the
-    correction with p = 1: otherwise repeated looks at growing data would inflate false positives.
+    correction with a p-value of 1: otherwise repeated looks at growing data would inflate the
+    number of false positives.
 
     Args:
         scores: scores of the study.

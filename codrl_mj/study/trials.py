@@ -28,7 +28,7 @@ from codrl_mj.training.folder import RESULT
 TEST_SECONDS = 1.0
 """Approximate time of a test [s of one core]."""
 FAILURE_MARGIN = 0.1
-"""A policy has failed if its score is below 1 by more than this."""
+"""Smallest deficit of a score below 1 with which a policy counts as failed."""
 RUNS, TOTALS = "runs.csv", "totals.json"
 """Published files of a study: a row for every policy and test; totals of its trainings."""
 MEASURES = (
@@ -88,7 +88,7 @@ class Cost(NamedTuple):
     """Computing time of an arm."""
 
     arm: Arm
-    """The arm."""
+    """Arm whose time is estimated."""
     finished: tuple[int, ...]
     """Seeds whose training is finished."""
     missing: tuple[int, ...]
@@ -130,7 +130,7 @@ class Grid:
     trials: tuple[Trial, ...]
     """All trials, without duplicates."""
     seeds_of: Callable[[Arm], range]
-    """Function arm -> seeds."""
+    """Function that returns the seeds of an arm."""
     episodes: int = 100
     """Test episodes of every policy, >= 1."""
     published: Path | None = None
@@ -214,8 +214,8 @@ class Grid:
         """Compute missing trainings and tests; failures are recorded in `root/failures`.
 
         Args:
-            workers: processes that compute.
-            accept_changes: continue started trainings even if code or packages have changed.
+            workers: settings of the worker processes.
+            accept_changes: True to continue started trainings even if code or packages changed.
             on_cell: called with `training` or `test` when one has finished or failed.
             on_seed: called after each group of seeds (one seed, or as many as occupy every core)
                 that produced a result.
@@ -375,7 +375,7 @@ class Collected:
     """Available results of a grid."""
 
     grid: Grid
-    """The grid."""
+    """Grid of the results."""
     folders: Mapping[tuple[str, int], Path]
     """Run folders of the finished trainings, by arm and seed."""
     evaluations: Mapping[str, Mapping[int, Mapping[str, Any]]]
@@ -383,12 +383,12 @@ class Collected:
     missing: tuple[str, ...]
     """Names of unfinished trainings, and of missing tests of finished ones."""
     failures: Mapping[str, str]
-    """Name -> error, for those in `missing` that have failed."""
+    """Name -> error, for trainings and tests in `missing` that have failed."""
     totals: Totals
     """Totals of the trainings."""
 
     def scores(self, trial: Trial, measure: str = "returns") -> dict[int, float]:
-        """Return a measure of a trial's policies by seed: means of intervals, medians of quartiles.
+        """Return a measure of a trial's policies by seed, as `to_scalar`.
 
         Policies without a value are left out. A trial outside the grid has no values.
         """
@@ -452,12 +452,12 @@ def trial_rows(
 
 
 def cell_name(name: str, seed: int) -> str:
-    """Return the name of a cell."""
+    """Return the name of a training or test with a seed."""
     return f"{name}, seed {seed}"
 
 
 def to_scalar(value: Any) -> Any:
-    """Return a measure as a number: the mean of an interval, the median of quartiles."""
+    """Return a measure as a number: of an interval the mean, of quartiles the median."""
     return value.get("mean", value.get("median")) if isinstance(value, Mapping) else value
 
 

@@ -1,1 +1,1 @@
-"""Motors from their bench logs."""
+"""Identification of motors from bench logs."""

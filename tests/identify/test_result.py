@@ -137,7 +137,7 @@ def test_an_unknown_rotor_inertia_of_the_datasheet_is_not_zero():
     whole = make_identified(*estimates, base=Drive().as_mapping())
     assert (
         whole.base_text
-        == "not from these logs but the motor's, by --motor: rotor_inertia = 4e-06 kg*m^2, "
+        == "not from these logs, but from the motor (--motor): rotor_inertia = 4e-06 kg*m^2, "
         "viscous_friction = 0 N*m*s/rad"
     )
     winding = make_identified(estimates[0], base=bare)
@@ -147,7 +147,7 @@ def test_an_unknown_rotor_inertia_of_the_datasheet_is_not_zero():
 def test_the_supply_is_taken_from_the_logs_and_reported(tmp_path):
     result = dataclasses.replace(motor(), supply=5.02)
     assert resolve(str(result.write(tmp_path)[0]), None, "a test").voltage_limit == 5.02
-    assert result.supply_text.startswith("supply 5.02 V: the largest of the logs")
+    assert result.supply_text.startswith("supply 5.02 V: largest voltage of the logs")
     assert json.loads((tmp_path / "result.json").read_text())["supply"] == 5.02
     assert "assumed" in motor().supply_text
 
@@ -194,7 +194,7 @@ def test_the_command_line_identifies_and_randomizes_within_the_intervals(tmp_pat
     assert main(f"{line} {known} --out {out} --holdout {wrong}".split()) == 0
     output = capsys.readouterr().out
     assert "the held-out log wrong has errors and is left out" in output
-    assert "supply 3 V: the largest of the logs" in output
+    assert "supply 3 V: largest voltage of the logs" in output
     assert "resistance" in output
     assert "identified" in output
     actuator = str(out / "actuator.yaml")

@@ -366,7 +366,7 @@ def test_coarse_sensors_are_found():
 def test_a_sagging_supply_is_found_if_the_duty_varies(motor):
     (finding,) = findings_of(make_log(motor, "chirp", sag=0.25), "sag")
     # At half of the duty, d^2 = 0.25 of the supply's 0.25 R acts at the motor.
-    assert float(finding.message.split()[5]) == pytest.approx(
+    assert float(finding.message.split()[8]) == pytest.approx(
         0.0625 * MOTORS[motor].resistance, rel=0.3
     )
     assert findings_of(make_log(motor, "chirp"), "sag") == []

@@ -89,7 +89,7 @@ def test_mappings_are_equivalent_to_text():
         ("current=a:A", "no time"),
         ("time=t:s,current=a", "current=a:A"),
         ("time=t,current=a:A", "time=t:s"),
-        ("time=t:s,current=a:V", "no unit of current"),
+        ("time=t:s,current=a:V", "is not a unit of current"),
         ("time=t:s,current=a:blub", "blub"),
         ("time=t:s,velocity=a:Hz", "rad/s"),
         ("time=t:s,velocity=a:1/s", "turns or radians"),
@@ -97,7 +97,7 @@ def test_mappings_are_equivalent_to_text():
         ("time=t:s,current=a:A,current=b:A", "twice"),
         ("time=t:s,current=a:A:V", "two colons"),
         ("time=t:s,current", "signal=formula:unit"),
-        ("time=t:s,current=a b:A", "no formula"),
+        ("time=t:s,current=a b:A", "not a formula"),
         ("time=t:s,current=a**2:A", "not allowed"),
         ("time=t:s,current=a[0]:A", "unknown column a[0]"),
         ("time=t:s,current=a[-1]:A", "not allowed"),
@@ -109,7 +109,7 @@ def test_mappings_are_equivalent_to_text():
         ),
         (
             "time=t:s,position=a:UNIT",
-            "the unit is not filled in; write the column's own, such as rad, deg or turn",
+            "the unit is not filled in; write the unit of the column, such as rad, deg or turn",
         ),
         ("time=t:s,current=a.real:A", "not allowed"),
         ("time=t:s,current=[a for a in b]:A", "not allowed"),
@@ -147,7 +147,7 @@ PROPOSED = {
         "torque=torque_N_m:N*m"
     ),
     "t_s,duty,vbus\n0,0.5,12\n0.1,-0.5,12": (
-        "time=t_s:s,duty=duty:1,bus=vbus:V,voltage=duty*vbus:V | share of the bus"
+        "time=t_s:s,duty=duty:1,bus=vbus:V,voltage=duty*vbus:V | times the bus voltage"
     ),
     "t_s,duty,voltage\n0,0.5,12\n0.1,-0.5,12.1": (
         "time=t_s:s,duty=duty:1,bus=voltage:V,voltage=duty*voltage:V | voltage: hardly changes,"

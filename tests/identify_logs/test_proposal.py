@@ -223,7 +223,7 @@ def test_columns_are_proposed_and_valid_once_the_units_are_filled_in(tmp_path, s
     assert proposal.problem is None
     if "UNIT" in expected:
         with pytest.raises(
-            ValueError, match="the unit is not filled in; write the column's own, such as"
+            ValueError, match="the unit is not filled in; write the unit of the column, such as"
         ):
             read_log(tmp_path / "log.csv", expected)
     log = read_log(tmp_path / "log.csv", fill_units(expected, "ms"))

@@ -163,7 +163,7 @@ def test_a_voltage_in_whole_millivolts_is_not_a_register(tmp_path):
         (
             "t,i\n1,2\n",
             "log.csv",
-            "1 of 1 rows can be used, must be 2 or more, and 80%: there are no more",
+            "1 of 1 rows can be used, must be at least 2 and 80% of all: there are no more",
         ),
         ("t,i\n3,2\n2,2\n1,2\n", "log.csv", "1 of 3 rows"),
         ("t,j\n1,2\n2,2\n", "log.csv", "unknown column i"),

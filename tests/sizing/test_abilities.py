@@ -184,11 +184,11 @@ def test_flags_override_fields_of_the_named_drive(tmp_path):
         (
             ("ideal",),
             (
-                "motor = 'ideal': no motor behind a drive, but the actuator family ideal; name a"
+                "motor = 'ideal': is not a drive, but of the actuator family ideal; name a"
                 " motor of the"
             ),
         ),
-        (("current_loop",), "no motor behind a drive, but the actuator family current_loop"),
+        (("current_loop",), "is not a drive, but of the actuator family current_loop"),
         (("rev-neo", 0.0), r"GearMotor\.gear_ratio = 0\.0: must be a finite number > 0"),
         (
             ("rev-neo", None, 10e3, 2e3),

@@ -339,7 +339,7 @@ def test_a_slower_servo_is_never_hopeless():
     )
     assert slower.verdict == TRY_IT
     assert (
-        "its servo asks for less where the motor is slower: evaluate the run on this motor"
+        "a servo asks for less if the motor is slower: evaluate the run on this motor"
         in slower.reason
     )
 

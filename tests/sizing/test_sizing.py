@@ -386,7 +386,7 @@ def test_on_a_slide_a_geared_motor_gets_a_wheel():
         (lambda: find_drive("frc-kim"), "did you mean 'frc-cim'"),
         (lambda: find_drive("frc-cim", gear_ratio=0.0), "gear_ratio = 0"),
         (lambda: find_drive("frc-cim", voltage=-1.0), "voltage = -1"),
-        (lambda: find_drive("lag"), "no motor behind a drive"),
+        (lambda: find_drive("lag"), "is not a drive"),
         (
             lambda: choose(steady(1.0, 1.0), ["frc-cim"], min_margin=1.0),
             r"min_margin = 1: must be >= 0 and < 1",
