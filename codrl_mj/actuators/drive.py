@@ -339,8 +339,8 @@ class Drive(ActuatorModel):
             nearest = max(round(samples), 1) / timestep
             raise ValueError(
                 f"SampledLoop.sample_rate = {controller.sample_rate:g}: a mechanical step of"
-                f" {timestep:g} s holds {samples:g} samples, must be a whole number of them; the"
-                f" nearest rate is {nearest:.8g} Hz"
+                f" {timestep:g} s has {samples:g} samples, must be a whole number; the nearest"
+                f" valid rate is {nearest:.8g} Hz"
             )
         radius = float(_radii(type(self), np.array([self.parameter_values]))[0])
         if not radius < 1.0:
@@ -385,7 +385,8 @@ class Drive(ActuatorModel):
             )
         if share > 0.5:
             warnings.warn(
-                f"{text}: above 0.5 it is inaccurate, above 1 it oscillates; {remedy}", stacklevel=2
+                f"{text}: above 0.5 the speed is inaccurate, above 1 it oscillates; {remedy}",
+                stacklevel=2,
             )
         elif share * samples > 3.0:
             warnings.warn(

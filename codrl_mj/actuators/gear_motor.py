@@ -88,7 +88,7 @@ class GearMotor(Checked):
             raise ValueError(
                 f"GearMotor.max_temperature = {self.max_temperature:g}: must be above"
                 f" ambient_temperature = {self.ambient_temperature:g} degC, or the drive would"
-                "never request a current"
+                " never request a current"
             )
         if (
             self.max_temperature < math.inf

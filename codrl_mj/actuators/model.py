@@ -53,7 +53,7 @@ class UnstableError(ValueError):
     """An actuator is unstable at the given time step; `allow_unstable=True` simulates it anyway."""
 
 
-class Nothing(NamedTuple):
+class Empty(NamedTuple):
     """Empty named tuple, for families without states or without signals."""
 
 
@@ -111,9 +111,9 @@ class ActuatorModel(fields.Checked):
     """Name of the family in mappings, files and on the command line. Optional: `module:Class` works
     without it.
     """
-    State: ClassVar[type] = Nothing
+    State: ClassVar[type] = Empty
     """State of the actuator: a `NamedTuple` of floats, all 0 at the start of an episode."""
-    Signals: ClassVar[type] = Nothing
+    Signals: ClassVar[type] = Empty
     """Signals after a step: a `NamedTuple` of floats. A signal named `saturated` is 1 while the
     actuator is at a limit; `voltage_saturated`, `current_saturated` and `temperature_saturated`
     tell which limit. Evaluations compute their electrical measures from the signals `current` [A]
@@ -392,8 +392,8 @@ def check_family(cls: Family) -> None:
         )
     if reserved := {"desired_force", "actual_force", "speed"} & {*cls.Signals._fields}:
         raise ValueError(
-            f"{cls.__name__}.Signals: {', '.join(reserved)}: every family has these: choose another"
-            " name"
+            f"{cls.__name__}.Signals: {', '.join(reserved)}: every family has these signals: choose"
+            " other names"
         )
     fields.check_names(cls.SIGNAL_UNITS, cls.Signals._fields, "signal", "SIGNAL_UNITS.")
     fields.check_names(cls.RANDOM, field_paths(cls), "field", "RANDOM: ")
@@ -418,8 +418,8 @@ def check_family(cls: Family) -> None:
     after, torque, _ = check_form(cls.advance, result, *advance_signature(cls))
     if not np.isfinite([*after, torque]).all():
         raise ValueError(
-            f"{source_location(cls.advance)}: returns the state {(*map(float, after),)} and the torque"
-            f" {torque}: must be finite"
+            f"{source_location(cls.advance)}: returns the state {(*map(float, after),)} and the"
+            f" torque {torque}: must be finite"
         )
     if cls.OBSERVED:
         readings = call(f"{cls.__name__}.observe", cls.observe, parameters, step, signals, inputs)

@@ -302,10 +302,10 @@ class Servo(Drive):
         super().check(timestep)
         if not _rates_match(self.loop.servo_rate, self.controller.sample_rate, timestep):
             raise ValueError(
-                f"ServoLoop.servo_rate = {self.loop.servo_rate:g}: must be a multiple of the"
-                f" mechanical step's rate, {1.0 / timestep:g} Hz, or that a multiple of it, and the"
-                f" drive's sample_rate = {self.controller.sample_rate:g} Hz a multiple of both; the"
-                " step's own rate always fits"
+                f"ServoLoop.servo_rate = {self.loop.servo_rate:g}: must be a multiple or a"
+                f" divisor of the mechanical step's rate, {1.0 / timestep:g} Hz, and divide the"
+                f" drive's sample_rate = {self.controller.sample_rate:g} Hz; the mechanical step's"
+                " rate itself always fits"
             )
 
     @classmethod

@@ -321,7 +321,7 @@ def derive(
         raise ValueError(
             f"datasheet.{worst.quantity} contradicts the rest by more than {tolerance:.0%}:"
             f" {worst}. Check the values and units of {sources}; raise tolerance, or pass"
-            " strict=False, if the maker does print them so"
+            " strict=False, if the manufacturer does print these values"
         )
     for name, field in PRINTED_NAMES.items():
         if field in printed:

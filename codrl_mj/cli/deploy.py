@@ -54,12 +54,12 @@ class Export:
     episodes: int = 5
     """Number of episodes that are run for the contract's ranges and reference values."""
     seed: int = 0
-    """Seed of the first episode; the others count up from it."""
+    """Seed of the first episode; each further episode uses the next integer."""
     float64: bool = False
     """Compute with double instead of float in the C code."""
     limit: tuple[str, ...] = ()
-    """Largest safe magnitudes of observations, as arm_velocity=30 arm=1.8. Beyond them the board
-    gives the safety command. An angle that is observed as cos_arm and sin_arm is called arm.
+    """Largest safe magnitudes of observations, such as arm_velocity=30 arm=1.8. Beyond them the
+    board sends the safety command. An angle that is observed as cos_arm and sin_arm is called arm.
     """
     board: str | None = None
     """Board whose memory and speed are checked: arduino-uno, arduino-due, nucleo-f446re,
@@ -121,8 +121,8 @@ class Export:
             return env
         if differing_fields := differences(trained_env.as_mapping(), env.as_mapping()):
             raise ValueError(
-                f"{', '.join(differing_fields)}: the environment that {subject.run} was trained in"
-                " is exported: leave the flags of the environment out; evaluate and board test take"
+                f"{', '.join(differing_fields)}: export uses the environment in which"
+                f" {subject.run} was trained: omit these flags; evaluate and board test accept"
                 " another --actuator"
             )
         return subject.env
@@ -150,9 +150,9 @@ class Test:
     target: str = "host"
     """Machine that runs the C code: host, or cortex-m4f."""
     episodes: int = 20
-    """Episodes, each from its own seed."""
+    """Number of episodes, each with a different seed."""
     seed: int = 0
-    """Seed of the first episode; the others count up from it."""
+    """Seed of the first episode; each further episode uses the next integer."""
     loop: bool = True
     """Let the C code also close the motors' current loop, sample by sample, if it has one."""
     actuator: str | None = None
@@ -285,11 +285,11 @@ class CheckLog:
 
 @dataclasses.dataclass(frozen=True)
 class RunBoard:
-    """Watch a real board at a serial port, or let it drive, and log its messages until any key.
+    """Watch a real board at a serial port, or let it drive, and log its messages to a file.
 
     Without --drive the board only reports its observations and the commands that it would give. The
     motor moves only with --drive, which ends by itself on an error, and always ends with the safety
-    command.
+    command. Any key ends the run.
 
     Example: codrl-mj board run furuta --port /dev/ttyACM0 --out swing.csv
     """

@@ -88,7 +88,7 @@ class List:
     """
 
     sort: Literal[tuple(_LIST_COLUMNS)] = "name"  # type: ignore[valid-type]
-    """Order: names from A, numbers from the highest."""
+    """Order: names from A to Z, numbers descending."""
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:

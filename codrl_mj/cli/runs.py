@@ -28,7 +28,7 @@ class Runs:
         tyro.conf.Positional[Path], tyro.conf.arg(help="Folder to search, with its subfolders.")
     ] = Path("runs")
     sort: Literal[SORT_KEYS] = "name"  # type: ignore[valid-type]
-    """Order of the list: names from A, numbers and times from the highest."""
+    """Order of the list: names from A to Z, numbers and times descending."""
     compare: tuple[Path, ...] = ()
     """Two or more run folders to compare instead of listing."""
     out: Path | None = None

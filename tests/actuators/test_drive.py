@@ -320,7 +320,7 @@ def test_the_current_limit_holds():
         (lambda: Drive(supply=24.0), r"Drive\.supply = 24\.0: must be a Supply"),
         (
             lambda: Drive().check(0.00123),
-            r"holds 24\.6 samples, must be a whole number of them; the nearest rate is 20325",
+            r"has 24\.6 samples, must be a whole number; the nearest valid rate is 20325",
         ),
         (
             lambda: Drive(controller=SampledLoop(kp=500.0)).check(0.002),
@@ -446,7 +446,7 @@ def test_raises_if_a_held_speed_is_unstable_and_warns_if_it_is_inaccurate():
         ValueError, match=r"^a0: .*takes 2\.\d+ of the rotor's speed .* leave motor.load_inertia 0"
     ):
         chain("dcx22l", 0.02, [math.inf])
-    with pytest.warns(UserWarning, match=r"above 0\.5 it is inaccurate"):
+    with pytest.warns(UserWarning, match=r"above 0\.5 the speed is inaccurate"):
         chain("1331t", 0.02, [math.inf])
     with pytest.warns(
         UserWarning, match=r"is 22\.4 times the time in which .* steps late: shorten the step"

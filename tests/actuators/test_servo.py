@@ -186,7 +186,7 @@ def test_feed_forward_removes_the_lag():
         ({"position_gain": 9000.0}, r"position_gain = 9000 well below 2\*pi\*f"),
         (
             {"servo_rate": 700.0},
-            r"servo_rate = 700: must be a multiple of the mechanical step's rate, 1000 Hz",
+            r"servo_rate = 700: must be a multiple or a divisor of the mechanical step's rate, 1000 Hz",
         ),
         ({"controls": "force"}, r"controls = 'force': must be one of position, velocity"),
         (
