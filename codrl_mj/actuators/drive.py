@@ -116,7 +116,8 @@ def end_step(
 ) -> tuple[tuple[float, float, float, float, float, float, float, float, float], float]:
     """Return the entries of `State` after a step, and the temperature [degC] of the winding.
 
-    Temperatures and shaft are those at the beginning of the step. The mean current heats.
+    Temperatures and shaft are those at the beginning of the step. The mean current of the step
+    heats the winding.
     """
     if shaft.has_thermal_model(parameters):
         heat = shaft.rises_after(
@@ -374,12 +375,12 @@ class Drive(ActuatorModel):
                 else "leave motor.load_inertia 0, so that the speed within a step is predicted"
             )
         text = (
-            f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes {share:.3g}"
-            f" of the rotor's speed in {timestep / samples:g} s during which it is held"
+            f"motor.rotor_inertia = {rotor:g}: the speed is held for {timestep / samples:g} s, in"
+            f" which the back-EMF of a saturated motor changes it by {share:.3g} times its value"
         )
         if share >= 2.0:
             raise UnstableError(
-                f"{text}, must be < 2; {remedy}, give the rotor its inertia (total:"
+                f"{text}, must be < 2; {remedy}, set motor.rotor_inertia (total now"
                 f" {inertia:.3g} kg*m^2), shorten the step, or pass allow_unstable=True to study it"
                 " as it is"
             )
@@ -395,9 +396,7 @@ class Drive(ActuatorModel):
                 " brakes its rotor. A free shaft is simulated well; at a stop, under friction or"
                 " with other joints the torque is delayed by about as many steps: "
                 + (
-                    "give rotor_inertia, or shorten the step"
-                    if rotor == 0.0
-                    else "shorten the step"
+                    "set rotor_inertia, or shorten the step" if rotor == 0.0 else "shorten the step"
                 ),
                 stacklevel=2,
             )
@@ -406,8 +405,8 @@ class Drive(ActuatorModel):
     def instability(cls, parameter_values: np.ndarray, timestep: float) -> np.ndarray:
         """Return the spectral radius of the loop over a sample; infinity for invalid combinations.
 
-        A step that is not a whole number of samples is invalid, and fields that `GearMotor` or
-        `SampledLoop` reject together.
+        A step that is not a whole number of samples is invalid, and so are combinations of fields
+        that `GearMotor` or `SampledLoop` reject.
         """
         columns = stability.parameter_columns(cls, parameter_values)
         samples = timestep * columns.sample_rate

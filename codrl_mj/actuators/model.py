@@ -234,7 +234,7 @@ class ActuatorModel(fields.Checked):
         """Return the commands available to an agent besides the force, by name.
 
         Raises:
-            ValueError: the fields do not allow a command that is read; the message names the field.
+            ValueError: a field makes a command impossible; the message names it.
         """
         return {}
 
@@ -243,7 +243,7 @@ class ActuatorModel(fields.Checked):
 
         Raises:
             UnstableError: the actuator is unstable; the message has the number and a remedy.
-            ValueError: the actuator cannot be simulated at all; the message likewise.
+            ValueError: the actuator cannot be simulated at all; the message has the reason.
         """
 
     def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
@@ -267,13 +267,13 @@ class ActuatorModel(fields.Checked):
         return self.INERTIA or self.MOTION or type(self) not in BUILT_IN
 
     def steps_per_sample(self, timestep: float) -> int:
-        """Return the number of mechanical steps [s] after which the sample pattern repeats."""
+        """Return the number of mechanical steps after which the pattern of samples repeats."""
         del timestep
         return 1
 
     def loop_remedy(self, inertia: float) -> str:
         """Return a remedy for the loop gains at an inertia [kg*m^2], for error messages."""
-        return f"It moves {inertia:.3g} kg*m^2 at its shaft: lower its gains."
+        return f"The inertia at its shaft is {inertia:.3g} kg*m^2: lower its gains."
 
     def check_at(self, timestep: float, allow_unstable: bool) -> None:
         """Run `check`, but ignore instability if `allow_unstable`.

@@ -91,7 +91,7 @@ class Export:
             ("", "name", "unit", "range"),
             rows,
         )
-        weights = extract_network(subject.policy).size
+        num_weights = extract_network(subject.policy).size
         if contract.controller["loop"] is None and contract.actuators:
             reason = (
                 f"this policy commands a {env.action}"
@@ -99,7 +99,9 @@ class Export:
                 else "the motors have different loops, or none"
             )
             print(f"no current loop: {reason}")
-        written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
+        written = (
+            f"wrote {self.out}: policy.onnx, contract.json, controller.c ({num_weights} numbers)"
+        )
         names = env.task, *(family_name(type(entry)) for entry in env.actuators)
         print(
             f"{written}; try:"

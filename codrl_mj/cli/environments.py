@@ -121,11 +121,11 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
         chosen: the two flags, as `scan_flags` returns them.
         task: the environment's name.
     """
-    world, all_names = defaults.source, (field.name for field in dataclasses.fields(EnvConfig))
+    source, all_names = defaults.source, (field.name for field in dataclasses.fields(EnvConfig))
     excluded = tuple(
         name
         for name in all_names
-        if name not in world.fields or name in ("task", "actuator", "options")
+        if name not in source.fields or name in ("task", "actuator", "options")
     )
     options = [
         (
@@ -136,7 +136,7 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
             ],
             value,
         )
-        for option, hint, text, value in world.option_flags(defaults)
+        for option, hint, text, value in source.option_flags(defaults)
     ]
     env_flags, family = (
         flag_dataclass(EnvConfig, defaults, excluded, options),
@@ -251,7 +251,7 @@ def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> En
                 f" add --env.randomize None to use the values of {name}",
                 stacklevel=2,
             )
-    world, env_flags = find_source(task), dict(vars(verb.env))
+    source, env_flags = find_source(task), dict(vars(verb.env))
     names = [field.name for field in dataclasses.fields(EnvConfig) if field.name != "options"]
     fields = {name: env_flags.pop(name) for name in names if name in env_flags}
     fields |= {
@@ -259,7 +259,7 @@ def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> En
         for nested_part in ("disturbances", "joint")
         if nested_part in fields
     }
-    options = world.options_of(env_flags)
+    options = source.options_of(env_flags)
     patterns = _patterns(verb.actuators)
     fields["randomize"] = _ranges(fields["randomize"], name, patterns)
     actuators = (
@@ -269,7 +269,7 @@ def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> En
     )
     config = EnvConfig(task, actuators, options=options)
     if patterns:
-        config = EnvConfig(task, world.overlaid(config, patterns), options=options)
+        config = EnvConfig(task, source.overlaid(config, patterns), options=options)
     actuator_fields = _set_fields(verb.actuator_fields)
     overridden = {
         pattern: override_actuator(actuator, actuator_fields)

@@ -25,9 +25,10 @@ Columns = Annotated[
         help=(
             "Columns of the signals, such as"
             " time=t:s,voltage=duty*vbus:V,current=i:mA,position=q:deg. Signals are voltage,"
-            " current, position, velocity, torque, bus, duty, temperature and command; formulas have"
-            " + - * /, twos_complement(column,16), sign_magnitude(column,11), unwrap(column,360),"
-            " atan2(y,x), abs, sign, sqrt, column[0] of a list: docs/identify_logs.md."
+            " current, position, velocity, torque, bus, duty, temperature and command; formulas can"
+            " contain + - * /, twos_complement(column,16), sign_magnitude(column,11),"
+            " unwrap(column,360), atan2(y,x), abs, sign, sqrt, and column[0] of a list"
+            " (docs/identify_logs.md)."
         ),
     ),
 ]
@@ -472,7 +473,7 @@ class SimulateLog:
         load, sampler = Load(**vars(self.load)), Sampler(**vars(self.sampler))
         log = simulate(drive, excitation, load, _sensors(self.sensor), sampler, self.seed)
         columns = write_log(self.out, log)
-        print(f"wrote {self.out}: {len(log.time)} rows; read it by --columns '{columns}'")
+        print(f"wrote {self.out}: {len(log.time)} rows; read it with --columns '{columns}'")
         return 0
 
 

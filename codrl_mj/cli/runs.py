@@ -111,7 +111,7 @@ def _print_comparison(comparison: Comparison) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Data:
-    """List published measurements of real motors, or download a data set: docs/identify.md.
+    """List published measurements of real motors, or download a data set (docs/identify.md).
 
     codrl_mj does not contain the data: files are downloaded from the authors' sites and checked by
     their digests.
@@ -158,7 +158,7 @@ class Cache:
     """Show or clear the cache of compiled code, which saves seconds in each process.
 
     CODRL_MJ_CACHE names another folder; CODRL_MJ_CACHE=off disables the cache. Outdated code is
-    never used, so that the cache need not be cleared: docs/engine.md.
+    never used, so you need not clear the cache (docs/engine.md).
 
     Example: codrl-mj cache --clear
     """

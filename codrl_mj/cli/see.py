@@ -181,7 +181,7 @@ class LiveView(EpisodeVerb):
             ):
                 raise RuntimeError(
                     "--native needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set:"
-                    " leave it out to see the simulation in a browser, also through ssh -L"
+                    " omit it to see the simulation in a browser, also through ssh -L"
                     " 8080:localhost:8080"
                 )
         else:

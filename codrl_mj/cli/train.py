@@ -299,8 +299,8 @@ def _base_config(chosen: argparse.Namespace) -> TrainConfig:
         overrides = {name: getattr(chosen, name) for name in ("task", "agent", "settings")}
         return read_config(Path(chosen.config), chosen.trust, **overrides)
     task = chosen.task or "cartpole"
-    world = find_source(task)
-    options = world.options_of({"options": chosen.options}) if chosen.options else {}
+    source = find_source(task)
+    options = source.options_of({"options": chosen.options}) if chosen.options else {}
     agent = (
         chosen.agent
         if chosen.agent in AGENTS or ":" in str(chosen.agent)
@@ -308,5 +308,5 @@ def _base_config(chosen: argparse.Namespace) -> TrainConfig:
     )
     settings = chosen.settings if chosen.settings in SETTINGS else "default"
     return TrainConfig.preset(
-        task, agent, settings, world.default_actuator, {"options": options} if options else {}
+        task, agent, settings, source.default_actuator, {"options": options} if options else {}
     )

@@ -181,7 +181,7 @@ def test_feed_forward_removes_the_lag():
     [
         (
             {"velocity_gain": 80.0},
-            r"outer loops are unstable: spectral radius .* It moves 0\.0201 kg\*m\^2",
+            r"outer loops are unstable: spectral radius .* The inertia at the joint is 0\.0201 kg\*m\^2",
         ),
         ({"position_gain": 9000.0}, r"position_gain = 9000 well below 2\*pi\*f"),
         (
