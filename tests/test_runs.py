@@ -153,7 +153,7 @@ def test_an_unreadable_actuator_is_called_custom(tmp_path, actuator):
     ("file", "content", "problem"),
     [
         ("config.json", b"{", "config.json is not a run configuration: it is truncated"),
-        ("config.json", b"[1]", "no JSON object"),
+        ("config.json", b"[1]", "not a JSON object"),
         ("config.json", b"{}", "it has no 'train'"),
         ("config.json", b'{"train": 4}', "it has no 'train'"),
         ("config.json", b"\xff\xfe", "not JSON"),

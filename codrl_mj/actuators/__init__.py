@@ -1,4 +1,4 @@
-"""Actuators as mathematics: what one is, the families of them, stability, names. No MuJoCo."""
+"""Actuators, their families, stability and names, as pure functions without MuJoCo."""
 
 from codrl_mj.actuators.current_loop import (
     CurrentLoop,

@@ -13,7 +13,7 @@ from codrl_mj.fields import Checked, real
 class GearMotor(Checked):
     """DC motor with a gear, or a brushless motor as seen by its drive, described by its datasheet.
 
-    Brushless motors: terminal quantities, line to line, of the equivalent DC motor.
+    For a brushless motor, the values are the line-to-line quantities of the equivalent DC motor.
 
     Raises:
         ValueError: a field is out of bounds; the message names field, value and bound.

@@ -107,8 +107,8 @@ class Lag(ActuatorModel):
         # of up to four of its steps.
         if self.time_constant > 4.0:
             warnings.warn(
-                f"Lag.time_constant = {self.time_constant:g}: 63 % of a step is delivered after"
-                f" {self.time_constant:g} s; it is in seconds: for {self.time_constant:g} ms write"
+                f"Lag.time_constant = {self.time_constant:g}: is in seconds, so 63 % of a step is"
+                f" delivered after {self.time_constant:g} s; for {self.time_constant:g} ms write"
                 f" {self.time_constant / 1e3:g}",
                 stacklevel=2,
             )

@@ -449,7 +449,7 @@ def test_raises_if_a_held_speed_is_unstable_and_warns_if_it_is_inaccurate():
     with pytest.warns(UserWarning, match=r"above 0\.5 the speed is inaccurate"):
         chain("1331t", 0.02, [math.inf])
     with pytest.warns(
-        UserWarning, match=r"is 22\.4 times the time in which .* steps late: shorten the step"
+        UserWarning, match=r"is 22\.4 times the time in which .* as many steps: shorten the step"
     ):
         chain("dcx22l", 0.2, [0.0])
     light = dataclasses.replace(

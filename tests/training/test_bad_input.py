@@ -154,10 +154,10 @@ def test_flags_that_contradict_a_run_raise(capsys, run, flags, expected):
         ("evaluate alone --task pendulum", "observation_space: the policy was trained with Box"),
         ("evaluate alone --task cartpole --which best", "omit --which"),
         # A zip file may contain code, and is loaded only with --trust.
-        ("evaluate model.zip --task cartpole --agent ppo", "Pass --trust if that author is you"),
+        ("evaluate model.zip --task cartpole --agent ppo", "Pass --trust if you are the author"),
         (
             "render model.zip --task cartpole --agent ppo --out film.gif",
-            "Pass --trust if that author is you",
+            "Pass --trust if you are the author",
         ),
         ("evaluate nowhere.zip --task cartpole --agent ppo", "no model at nowhere.zip"),
         ("evaluate model.zip --agent ppo --trust", "name it with --task"),
