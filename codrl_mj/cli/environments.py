@@ -88,7 +88,7 @@ Actuators = Annotated[
     tyro.conf.arg(
         metavar="PATTERN=NAME",
         help=(
-            "Actuators of individual motors, which override --actuator. NAME is as for --actuator;"
+            "Actuators of individual motors, which override --actuator and take the same names."
             " PATTERN is a regular expression that must match the whole name of the motor or its"
             " joint. Patterns joined by & give the model's actuators of one joint a common motor."
             " Instead of pairs, a YAML file of patterns and actuators, as codrl-mj motor choose"
