@@ -92,7 +92,7 @@ def flag(default: bool) -> Any:
 
 
 def choice(default: str, *options: str) -> Any:
-    """Return a field for one of several words, which arrays represent by their index."""
+    """Return a field for one of several options; parameter vectors store the option's index."""
     field = _bounded(default, lambda value: value in options, f"one of {', '.join(options)}")
     return dataclasses.field(default=default, metadata={**field.metadata, "options": options})
 
@@ -128,7 +128,7 @@ def reals(default: tuple[float, ...] | None = None) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Checked:
-    """Base of dataclasses whose fields are validated, made with the functions above.
+    """Base class that validates the fields that are declared with the functions above.
 
     Raises:
         ValueError: a field is out of bounds; the message has its name, its value and the bound.
@@ -171,8 +171,8 @@ def check_memory(size: float, purpose: str, remedy: str) -> None:
     """
     if (available := free_memory()) is not None and size > available:
         raise ValueError(
-            f"{purpose}: about {size / 1e9:,.3g} GB of memory, of which {available / 1e9:.3g} are"
-            f" free; {remedy}"
+            f"{purpose}: needs about {size / 1e9:,.3g} GB of memory, but only"
+            f" {available / 1e9:.3g} GB are free; {remedy}"
         )
 
 
@@ -192,10 +192,10 @@ def check_names(
         known: known names.
         label: kind of name, such as `actuator field`.
         prefix: text before each name in the message.
-        list_all: list all known names in addition to the nearest ones, for names that other
-            programs also have, with other spellings.
-        listed_by: command that lists the known names if there are many.
-        nested: dotted names of nested fields, suggested if the name of a part was omitted.
+        list_all: list all known names even if there are similar ones, for names that other programs
+            spell differently.
+        listed_by: command that lists the known names, if they are too many for the message.
+        nested: dotted names of nested fields, suggested if a name lacks the part before the dot.
     """
     known, nested = list(known), list(nested)
     for name in names:
@@ -251,7 +251,7 @@ def check_pattern(pattern: str) -> None:
     except (re.error, TypeError) as error:
         raise ValueError(
             f"{pattern!r}: must be a regular expression ({error}); '.*' matches any name, 'leg.*'"
-            " those of a leg"
+            " names that begin with leg"
         ) from None
 
 
@@ -259,7 +259,7 @@ def check_joint_dynamics(value: Any) -> None:
     """Raise if a value is not valid for `joint_dynamics` of `codrl_mj.add_motors`."""
     if value not in (None, "keep", "replace"):
         raise ValueError(
-            f"joint_dynamics = {value!r}: must be keep or replace; None keeps and warns"
+            f"joint_dynamics = {value!r}: must be keep, replace, or None (keep, with a warning)"
         )
 
 
@@ -270,10 +270,10 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def _nearest(name: object, known: Iterable[str]) -> list[str]:
-    """Return the few names that begin with a name or contain all of its words, or the closest one.
+    """Return up to three names that begin with a name or contain all its words, or the closest one.
 
-    Of dotted names only the last parts are compared if the parts before them are known: a common
-    beginning does not make two names more similar.
+    If the part before the last dot is known, only the last part is compared, because a common
+    prefix does not make two names more similar.
     """
     text, spelt = str(name).lower(), {known_name.lower(): known_name for known_name in known}
     with_prefix = [
@@ -304,7 +304,7 @@ def _nearest(name: object, known: Iterable[str]) -> list[str]:
 
 
 def _words(name: str) -> set[str]:
-    """Return the words of a name or a flag."""
+    """Return the words of a name or a flag that have three or more characters."""
     return set(re.findall(r"[a-z0-9]{3,}", name.replace("_", " ")))
 
 
@@ -351,11 +351,11 @@ def build(cls: type, mapping: object, label: str, prefix: str = "") -> Any:
     )
 
     def convert(key: str, value: Any) -> Any:
-        """Return a nested mapping as its dataclass; a dataclass is returned unchanged."""
+        """Return a nested mapping as its dataclass; other values are returned unchanged."""
         if key not in nested or value is None or isinstance(value, nested[key]):
-            # The mapping changes only some values of the part, so the others come from its default.
             return value
         if isinstance(value, Mapping) and key in absent:
+            # The mapping changes only some values of the part, so the others come from its default.
             value = {**dataclasses.asdict(absent[key]), **value}
         return build(nested[key], value, label, f"{prefix}{key}.")
 
@@ -380,7 +380,7 @@ def parts(cls: type) -> dict[str, type]:
 
 @functools.cache
 def declared_parts(cls: Any) -> dict[str, Any]:
-    """Return the fields of `parts` that are declared as a class or union, with the declaration."""
+    """Return field -> declared type, for fields of `parts` declared as a class or a union."""
     # Names that only a type checker imports cannot be resolved at run time.
     try:
         hints = typing.get_type_hints(cls)
@@ -401,6 +401,7 @@ def _bounded(
     kind: type | None = None,
     between: tuple[float | None, float | None] = (None, None),
 ) -> Any:
+    """Return a field whose metadata hold its check, its unit and its range."""
     metadata = {
         "bound": (is_valid, text, optional or default is None, kind),
         "unit": unit,

@@ -23,7 +23,7 @@ import numpy as np
 from codrl_mj import fields
 
 Form = Any
-"""Form of a return value: the name of a number, or a tuple of forms."""
+"""Expected structure of a return value: the name of a number, or a tuple of such structures."""
 
 
 def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -50,9 +50,13 @@ def source_location(function: Callable[..., Any], line: int | None = None) -> st
 
 
 def check_form(function: Callable[..., Any], value: Any, form: Form, declared: str) -> Any:
-    """Return a function's return value if it has the form that is described in `declared`.
+    """Return a function's return value, after checking that it has the expected form.
 
-    The value may also be the type that numba inferred.
+    Args:
+        function: the function.
+        value: its return value, or the type that numba inferred for it.
+        form: the expected form.
+        declared: reference to the description of the form, for the message.
     """
     if not _fits(value, form):
         raise ValueError(
@@ -71,7 +75,7 @@ def _fits(value: Any, form: Form) -> bool:
 
 
 def _describe_value(value: Any) -> str:
-    """Describe a returned value; numba's types have names."""
+    """Describe a returned value, or a type that numba inferred, by its name."""
     if isinstance(value, tuple):
         flat = _fits(value, ("",) * len(value))
         return f"a tuple of {len(value)}" if flat else f"({', '.join(map(_describe_value, value))})"
@@ -105,7 +109,7 @@ def compile_error_message(function: Callable[..., Any], error: Exception) -> str
     )
     line = re.search(r'(?m)^\s*File ".+", line (\d+):', text)
     return (
-        f"{source_location(function, int(line[1]) if line else None)}: numba does not compile it:"
+        f"{source_location(function, int(line[1]) if line else None)}: numba cannot compile it:"
         f" {last_cause.strip()}"
     )
 
@@ -117,7 +121,7 @@ def asset_folder() -> Path:
         if folder.is_dir():
             return folder
     raise FileNotFoundError(
-        f"no models beside codrl_mj in {package}: the installation is incomplete"
+        f"no model files next to {package}: the installation of codrl_mj is incomplete"
     )
 
 
@@ -128,7 +132,7 @@ def asset_path(name: str) -> Path:
             return path
     if Path(name).parent == Path():
         raise FileNotFoundError(
-            f"no model {name!r} in {Path.cwd()}, nor among codrl_mj's: give the whole path"
+            f"no model {name!r} in {Path.cwd()} or among the models of codrl_mj: give the full path"
         )
     raise FileNotFoundError(f"no model file {name}")
 
@@ -161,7 +165,9 @@ def read_text(path: Path) -> str:
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a YAML or JSON file, with numbers as in YAML 1.2 and JSON: 3e-4, Infinity; not 20:1.
+    """Read a YAML or JSON file, with the numbers of YAML 1.2 and JSON, such as 3e-4 and Infinity.
+
+    The value 20:1 is a text; YAML 1.1 reads it as 1201.
 
     Raises:
         ValueError: the file is not YAML, or a mapping has a key twice.
@@ -197,7 +203,7 @@ def read_yaml(path: Path) -> Any:
 
 
 class UntrustedCodeError(ValueError):
-    """A refused import of a module that a file names and that the user has not trusted."""
+    """Error: a file names a module that was not imported, because the user has not trusted it."""
 
 
 _IMPORTS_ALLOWED = contextvars.ContextVar("trusted", default=True)
@@ -225,9 +231,8 @@ def load_module(text: str) -> Any:
     module = text.partition(":")[0]
     if not _IMPORTS_ALLOWED.get():
         raise UntrustedCodeError(
-            f"{text!r}: needs the module {module}, and importing it executes whatever its author"
-            " put there. Pass --trust (in Python: trust=True) if you are the author, or if you"
-            " would run the author's programs"
+            f"{text!r}: needs the module {module}, and importing it executes its code. Pass --trust"
+            " (in Python: trust=True) if you are its author, or if you trust the author"
         )
     try:
         return importlib.import_module(module)
@@ -236,8 +241,8 @@ def load_module(text: str) -> Any:
             isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
         ):
             raise ValueError(
-                f"{text!r}: {error}; must be module:NAME of a module that is installed or in the"
-                f" present folder, {Path.cwd()}; on the command line FILE.py:NAME does as well"
+                f"{text!r}: {error}; must be module:NAME, where the module is installed or in the"
+                f" present folder, {Path.cwd()}; the command line also accepts FILE.py:NAME"
             ) from None
         location, is_package_error = _origin(error)
         description = (
@@ -278,9 +283,10 @@ def load_object(text: str) -> Any:
     try:
         return functools.reduce(getattr, name.split("."), module)
     except AttributeError as error:
-        hint = fields.did_you_mean(name, vars(module)).rstrip() or "see"
+        hint = fields.did_you_mean(name, vars(module)).rstrip() or "check the name;"
         raise ValueError(
-            f"{text!r}: {error}; must be module:NAME; {hint} {getattr(module, '__file__', '')}"
+            f"{text!r}: {error}; must be module:NAME; {hint} the file is"
+            f" {getattr(module, '__file__', '')}"
         ) from None
 
 
@@ -309,14 +315,16 @@ def look_up(
         if base_class is None or (isinstance(value, type) and issubclass(value, base_class)):
             return value
         raise ValueError(
-            f"{label} {name!r}: {value!r} is no subclass of codrl_mj's {base_class.__name__}"
+            f"{label} {name!r}: {value!r} is not a subclass of codrl_mj's {base_class.__name__}"
         )
     hint = fields.did_you_mean(name, [*known, *itertools.chain(*(suggestions or {}).values())])
     choices = (
-        hint + "It can be" if hint else f"Known: {', '.join([*known, *(suggestions or {})])}, or"
+        hint + "It can also be"
+        if hint
+        else f"Known: {', '.join([*known, *(suggestions or {})])}, or"
     )
     remedy = (
-        f"{choices} module:NAME of your own"
+        f"{choices} your own as module:NAME"
         if allow_user_code
         else hint or choices.removesuffix(", or")
     )

@@ -536,7 +536,7 @@ def test_a_policy_is_not_measured_where_its_observations_or_actions_are_others()
     policy.action_space = EnvConfig("pendulum", action="voltage").make().action_space
     with pytest.raises(
         ValueError,
-        match=r"action_space: the policy was trained with Box.*pendulum as it is set has",
+        match=r"action_space: the policy was trained with Box.*but pendulum now has",
     ):
         evaluate(policy, EnvConfig("pendulum"), episodes=1)
     policy.action_space = None

@@ -278,7 +278,7 @@ def test_a_zip_is_opened_only_with_trust_and_predicts_like_the_model(tmp_path):
     model, path, executed = make_model(), tmp_path / "model.zip", tmp_path / "executed"
     model.bomb = Bomb(executed)
     model.save(path)
-    with pytest.raises(ValueError, match=r"executes whatever its author put there\. Pass --trust"):
+    with pytest.raises(ValueError, match=r"executes their code\. Pass --trust"):
         load_sb3_zip(path, "ppo", trust=False)
     assert not executed.exists()
     policy = load_sb3_zip(path, "ppo", trust=True)

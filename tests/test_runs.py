@@ -153,7 +153,7 @@ def test_an_unreadable_actuator_is_called_custom(tmp_path, actuator):
     ("file", "content", "problem"),
     [
         ("config.json", b"{", "config.json is not a run configuration: it is truncated"),
-        ("config.json", b"[1]", "no JSON object"),
+        ("config.json", b"[1]", "not a JSON object"),
         ("config.json", b"{}", "it has no 'train'"),
         ("config.json", b'{"train": 4}', "it has no 'train'"),
         ("config.json", b"\xff\xfe", "not JSON"),
@@ -162,7 +162,7 @@ def test_an_unreadable_actuator_is_called_custom(tmp_path, actuator):
         (
             "evaluation.json",
             b"3",
-            "evaluation.json is not a policy evaluation: it is no JSON object",
+            "evaluation.json is not a policy evaluation: it is not a JSON object",
         ),
         ("progress.csv", b"\xff\xfe\x00", "progress.csv"),
         ("progress.csv", b"a,b\n1,2\n", "progress.csv has no column 'steps'"),

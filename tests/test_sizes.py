@@ -32,7 +32,8 @@ def test_the_free_memory_is_read_from_the_system():
 def test_raises_only_beyond_the_free_memory(small):
     fields.check_memory(0.99e9, "a thing", "remedy")
     with pytest.raises(
-        ValueError, match=r"^a thing: about 1.01 GB of memory, of which 1 are free; remedy$"
+        ValueError,
+        match=r"^a thing: needs about 1.01 GB of memory, but only 1 GB are free; remedy$",
     ):
         fields.check_memory(1.01e9, "a thing", "remedy")
 
@@ -43,9 +44,9 @@ def test_raises_only_beyond_the_free_memory(small):
         # The drive's rate is 20 kHz, that of the rows 5 kHz.
         (
             "--duration 1e5",
-            "100,000 s are 2,000,000,000 samples of the drive and 500,000,000 rows: about",
+            "100,000 s are 2,000,000,000 samples of the drive and 500,000,000 rows: needs about",
         ),
-        ("--rate 1e9", "4 s are 80,000 samples of the drive and 4,000,000,000 rows: about"),
+        ("--rate 1e9", "4 s are 80,000 samples of the drive and 4,000,000,000 rows: needs about"),
     ],
 )
 @pytest.mark.usefixtures("small")
@@ -81,7 +82,7 @@ def test_raises_for_too_many_parallel_episodes():
     env = EnvConfig("cartpole")
     with pytest.raises(
         ValueError,
-        match=r"episodes = 1,000,000, which run side by side: about 100 GB .*; run fewer",
+        match=r"episodes = 1,000,000, which run side by side: needs about 100 GB .*; run fewer",
     ):
         run_episodes(RandomPolicy("cartpole"), env.make, 1_000_000)
     with pytest.raises(ValueError, match="evaluation_episodes = 0: must be >= 1"):
@@ -109,9 +110,9 @@ def test_an_endless_episode_stops_before_the_memory_is_full(monkeypatch):
         (
             "ppo",
             {"rollout_steps": 10**9, "batch_size": 1000},
-            r"rollout_steps = 1,000,000,000: about 16 GB",
+            r"rollout_steps = 1,000,000,000: needs about 16 GB",
         ),
-        ("sac", {"buffer_size": 10**9}, r"buffer_size = 1,000,000,000: about 28 GB"),
+        ("sac", {"buffer_size": 10**9}, r"buffer_size = 1,000,000,000: needs about 28 GB"),
     ],
 )
 @pytest.mark.usefixtures("small")

@@ -83,7 +83,7 @@ def test_errors_of_numba_become_one_sentence(name, body):
         message = error_message(
             lambda: (compiled_outcomes(task), compiled_constrain(*constraint_arguments))
         )
-    assert f"in {name}: numba does not compile it: " in message or f"in {name}: returns " in message
+    assert f"in {name}: numba cannot compile it: " in message or f"in {name}: returns " in message
 
 
 def test_the_message_has_numbas_error_and_its_line():
@@ -91,7 +91,7 @@ def test_the_message_has_numbas_error_and_its_line():
     message = error_message(lambda: compiled_outcomes(task))
     assert (
         message
-        == "slip.py:3, in reward: numba does not compile it: np.linalg.norm() only supported for"
+        == "slip.py:3, in reward: numba cannot compile it: np.linalg.norm() only supported for"
         " array types"
     )
 

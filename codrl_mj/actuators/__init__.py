@@ -1,4 +1,4 @@
-"""Actuators as mathematics: what one is, the families of them, stability, names. No MuJoCo."""
+"""Actuators, their families, stability and names, as pure functions without MuJoCo."""
 
 from codrl_mj.actuators.current_loop import (
     CurrentLoop,
@@ -17,10 +17,10 @@ from codrl_mj.actuators.model import (
     FAMILIES,
     ActuatorModel,
     Command,
+    Empty,
     Family,
     Inputs,
     JointAdditions,
-    Nothing,
     UnstableError,
     family_id,
     family_name,
@@ -73,7 +73,7 @@ __all__ = [
     "JointAdditions",
     "Lag",
     "Motor",
-    "Nothing",
+    "Empty",
     "SampledLoop",
     "Servo",
     "ServoLoop",

@@ -154,10 +154,10 @@ def advance(
     1/(1 + Td*s). Both use backward Euler, so they are stable at any step and become the paper's sum
     and difference at leak = 0 and Td = 0.
 
-    The controller reads i + current_bias + current_noise*n, with a standard normal n for each
-    electrical step that is a function of key, time and electrical step: computing the step again
-    gives the same value. The available voltage is the smaller of max_voltage and the supply's
-    voltage, which drops with the current at the start of the electrical step.
+    The controller reads i + current_bias + current_noise*n. The standard normal number n is a
+    function of key, time and electrical step, so computing a step again gives the same value. The
+    available voltage is the smaller of max_voltage and the supply's voltage, which drops with the
+    current at the start of the electrical step.
 
     Args:
         parameters: named as the fields of `DCMotorActuator` and its parts.
@@ -177,12 +177,12 @@ def advance(
     for substep in range(substeps):
         sensor_error = parameters.current_bias
         if parameters.current_noise > 0.0:
+            # The callback may be called at intermediate times of a step, so the step's number is
+            # rounded.
             step = int(inputs.time / timestep + 0.5)
             sensor_error += parameters.current_noise * noise.standard_normal(
                 inputs.noise_key, step, substep
             )
-        # The callback may be called at intermediate times of a step, so the step's number is
-        # rounded.
         if parameters.supply_resistance > 0.0:
             sag = parameters.supply_resistance * abs(current)
             available = min(parameters.max_voltage, max(open_circuit - sag, 0.0))

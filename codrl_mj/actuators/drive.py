@@ -116,7 +116,8 @@ def end_step(
 ) -> tuple[tuple[float, float, float, float, float, float, float, float, float], float]:
     """Return the entries of `State` after a step, and the temperature [degC] of the winding.
 
-    Temperatures and shaft are those at the beginning of the step. The mean current heats.
+    Temperatures and shaft are those at the beginning of the step. The mean current of the step
+    heats the winding.
     """
     if shaft.has_thermal_model(parameters):
         heat = shaft.rises_after(
@@ -339,8 +340,8 @@ class Drive(ActuatorModel):
             nearest = max(round(samples), 1) / timestep
             raise ValueError(
                 f"SampledLoop.sample_rate = {controller.sample_rate:g}: a mechanical step of"
-                f" {timestep:g} s holds {samples:g} samples, must be a whole number of them; the"
-                f" nearest rate is {nearest:.8g} Hz"
+                f" {timestep:g} s has {samples:g} samples, must be a whole number; the nearest"
+                f" valid rate is {nearest:.8g} Hz"
             )
         radius = float(_radii(type(self), np.array([self.parameter_values]))[0])
         if not radius < 1.0:
@@ -374,18 +375,19 @@ class Drive(ActuatorModel):
                 else "leave motor.load_inertia 0, so that the speed within a step is predicted"
             )
         text = (
-            f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes {share:.3g}"
-            f" of the rotor's speed in {timestep / samples:g} s during which it is held"
+            f"motor.rotor_inertia = {rotor:g}: the speed is held for {timestep / samples:g} s, in"
+            f" which the back-EMF of a saturated motor changes it by {share:.3g} times its value"
         )
         if share >= 2.0:
             raise UnstableError(
-                f"{text}, must be < 2; {remedy}, give the rotor its inertia (total:"
+                f"{text}, must be < 2; {remedy}, set motor.rotor_inertia (total now"
                 f" {inertia:.3g} kg*m^2), shorten the step, or pass allow_unstable=True to study it"
                 " as it is"
             )
         if share > 0.5:
             warnings.warn(
-                f"{text}: above 0.5 it is inaccurate, above 1 it oscillates; {remedy}", stacklevel=2
+                f"{text}: above 0.5 the speed is inaccurate, above 1 it oscillates; {remedy}",
+                stacklevel=2,
             )
         elif share * samples > 3.0:
             warnings.warn(
@@ -394,9 +396,7 @@ class Drive(ActuatorModel):
                 " brakes its rotor. A free shaft is simulated well; at a stop, under friction or"
                 " with other joints the torque is delayed by about as many steps: "
                 + (
-                    "give rotor_inertia, or shorten the step"
-                    if rotor == 0.0
-                    else "shorten the step"
+                    "set rotor_inertia, or shorten the step" if rotor == 0.0 else "shorten the step"
                 ),
                 stacklevel=2,
             )
@@ -405,8 +405,8 @@ class Drive(ActuatorModel):
     def instability(cls, parameter_values: np.ndarray, timestep: float) -> np.ndarray:
         """Return the spectral radius of the loop over a sample; infinity for invalid combinations.
 
-        A step that is not a whole number of samples is invalid, and fields that `GearMotor` or
-        `SampledLoop` reject together.
+        A step that is not a whole number of samples is invalid, and so are combinations of fields
+        that `GearMotor` or `SampledLoop` reject.
         """
         columns = stability.parameter_columns(cls, parameter_values)
         samples = timestep * columns.sample_rate

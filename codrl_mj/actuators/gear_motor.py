@@ -13,7 +13,7 @@ from codrl_mj.fields import Checked, real
 class GearMotor(Checked):
     """DC motor with a gear, or a brushless motor as seen by its drive, described by its datasheet.
 
-    Brushless motors: terminal quantities, line to line, of the equivalent DC motor.
+    For a brushless motor, the values are the line-to-line quantities of the equivalent DC motor.
 
     Raises:
         ValueError: a field is out of bounds; the message names field, value and bound.
@@ -88,7 +88,7 @@ class GearMotor(Checked):
             raise ValueError(
                 f"GearMotor.max_temperature = {self.max_temperature:g}: must be above"
                 f" ambient_temperature = {self.ambient_temperature:g} degC, or the drive would"
-                "never request a current"
+                " never request a current"
             )
         if (
             self.max_temperature < math.inf

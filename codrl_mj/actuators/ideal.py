@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
-from codrl_mj.actuators.model import ActuatorModel, Inputs, Nothing
+from codrl_mj.actuators.model import ActuatorModel, Empty, Inputs
 
 
 class Signals(NamedTuple):
@@ -18,11 +18,11 @@ class Signals(NamedTuple):
 def advance(
     parameters: Any,  # noqa: ARG001
     timestep: float,  # noqa: ARG001
-    state: Nothing,  # noqa: ARG001
+    state: Empty,  # noqa: ARG001
     inputs: Inputs,
-) -> tuple[Nothing, float, Signals]:
+) -> tuple[Empty, float, Signals]:
     """Deliver the desired torque."""
-    return Nothing(), inputs.desired_torque, Signals(0.0, 0.0, 0.0, 0.0)
+    return Empty(), inputs.desired_torque, Signals(0.0, 0.0, 0.0, 0.0)
 
 
 @dataclasses.dataclass(frozen=True)

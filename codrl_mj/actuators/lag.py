@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators.model import ActuatorModel, Inputs, Nothing
+from codrl_mj.actuators.model import ActuatorModel, Empty, Inputs
 from codrl_mj.fields import real
 
 HISTORY = 8
@@ -30,7 +30,7 @@ class State(NamedTuple):
 
 def advance(
     parameters: Any, timestep: float, state: State, inputs: Inputs
-) -> tuple[State, float, Nothing]:
+) -> tuple[State, float, Empty]:
     """Advance tau' = (gain*u(t - delay) - tau)/T exactly, with u held over a step.
 
     The update is tau -> g*u + (tau - g*u)*exp(-dt/T). The returned torque is that at the end of the
@@ -71,7 +71,7 @@ def advance(
         state.c6,
         state.c7,
     )
-    return after, torque, Nothing()
+    return after, torque, Empty()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,8 +107,8 @@ class Lag(ActuatorModel):
         # of up to four of its steps.
         if self.time_constant > 4.0:
             warnings.warn(
-                f"Lag.time_constant = {self.time_constant:g}: 63 % of a step is delivered after"
-                f" {self.time_constant:g} s; it is in seconds: for {self.time_constant:g} ms write"
+                f"Lag.time_constant = {self.time_constant:g}: is in seconds, so 63 % of a step is"
+                f" delivered after {self.time_constant:g} s; for {self.time_constant:g} ms write"
                 f" {self.time_constant / 1e3:g}",
                 stacklevel=2,
             )

@@ -53,7 +53,7 @@ class UnstableError(ValueError):
     """An actuator is unstable at the given time step; `allow_unstable=True` simulates it anyway."""
 
 
-class Nothing(NamedTuple):
+class Empty(NamedTuple):
     """Empty named tuple, for families without states or without signals."""
 
 
@@ -111,9 +111,9 @@ class ActuatorModel(fields.Checked):
     """Name of the family in mappings, files and on the command line. Optional: `module:Class` works
     without it.
     """
-    State: ClassVar[type] = Nothing
+    State: ClassVar[type] = Empty
     """State of the actuator: a `NamedTuple` of floats, all 0 at the start of an episode."""
-    Signals: ClassVar[type] = Nothing
+    Signals: ClassVar[type] = Empty
     """Signals after a step: a `NamedTuple` of floats. A signal named `saturated` is 1 while the
     actuator is at a limit; `voltage_saturated`, `current_saturated` and `temperature_saturated`
     tell which limit. Evaluations compute their electrical measures from the signals `current` [A]
@@ -234,7 +234,7 @@ class ActuatorModel(fields.Checked):
         """Return the commands available to an agent besides the force, by name.
 
         Raises:
-            ValueError: the fields do not allow a command that is read; the message names the field.
+            ValueError: a field makes a command impossible; the message names it.
         """
         return {}
 
@@ -243,7 +243,7 @@ class ActuatorModel(fields.Checked):
 
         Raises:
             UnstableError: the actuator is unstable; the message has the number and a remedy.
-            ValueError: the actuator cannot be simulated at all; the message likewise.
+            ValueError: the actuator cannot be simulated at all; the message has the reason.
         """
 
     def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
@@ -267,13 +267,13 @@ class ActuatorModel(fields.Checked):
         return self.INERTIA or self.MOTION or type(self) not in BUILT_IN
 
     def steps_per_sample(self, timestep: float) -> int:
-        """Return the number of mechanical steps [s] after which the sample pattern repeats."""
+        """Return the number of mechanical steps after which the pattern of samples repeats."""
         del timestep
         return 1
 
     def loop_remedy(self, inertia: float) -> str:
         """Return a remedy for the loop gains at an inertia [kg*m^2], for error messages."""
-        return f"It moves {inertia:.3g} kg*m^2 at its shaft: lower its gains."
+        return f"The inertia at its shaft is {inertia:.3g} kg*m^2: lower its gains."
 
     def check_at(self, timestep: float, allow_unstable: bool) -> None:
         """Run `check`, but ignore instability if `allow_unstable`.
@@ -392,8 +392,8 @@ def check_family(cls: Family) -> None:
         )
     if reserved := {"desired_force", "actual_force", "speed"} & {*cls.Signals._fields}:
         raise ValueError(
-            f"{cls.__name__}.Signals: {', '.join(reserved)}: every family has these: choose another"
-            " name"
+            f"{cls.__name__}.Signals: {', '.join(reserved)}: every family has these signals: choose"
+            " other names"
         )
     fields.check_names(cls.SIGNAL_UNITS, cls.Signals._fields, "signal", "SIGNAL_UNITS.")
     fields.check_names(cls.RANDOM, field_paths(cls), "field", "RANDOM: ")
@@ -418,8 +418,8 @@ def check_family(cls: Family) -> None:
     after, torque, _ = check_form(cls.advance, result, *advance_signature(cls))
     if not np.isfinite([*after, torque]).all():
         raise ValueError(
-            f"{source_location(cls.advance)}: returns the state {(*map(float, after),)} and the torque"
-            f" {torque}: must be finite"
+            f"{source_location(cls.advance)}: returns the state {(*map(float, after),)} and the"
+            f" torque {torque}: must be finite"
         )
     if cls.OBSERVED:
         readings = call(f"{cls.__name__}.observe", cls.observe, parameters, step, signals, inputs)

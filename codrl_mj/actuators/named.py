@@ -17,18 +17,18 @@ from codrl_mj.actuators.servo import Servo
 from codrl_mj.user_code import allow_imports_from_files, look_up, read_yaml
 
 NAMED: dict[str, tuple[str, Callable[[DCMotorActuator], ActuatorModel]]] = {
-    "ideal": ("force = desired force: no motor at all", lambda _: IDEAL),
+    "ideal": ("no motor, the actual force equals the desired one", lambda _: IDEAL),
     "paper": ("the paper's motor and gains for the task", lambda paper: paper),
     "weak": (
-        "the paper's motor under a weak loop: kp = ki = 1",
+        "the paper's motor with a weak current loop (kp = ki = 1)",
         lambda paper: dataclasses.replace(paper, controller=CurrentLoop(kp=1.0, ki=1.0)),
     ),
     "weaker": (
-        "a weaker loop: kp = ki = 0.2",
+        "the paper's motor with a weaker current loop (kp = ki = 0.2)",
         lambda paper: dataclasses.replace(paper, controller=CurrentLoop(kp=0.2, ki=0.2)),
     ),
     "open_loop": (
-        "no feedback, u = R*i_ref + kE*omega, and a slow winding: L = 0.5 H",
+        "no current feedback (u = R*i_ref + kE*omega), and a slow winding (L = 0.5 H)",
         lambda paper: DCMotorActuator(
             dataclasses.replace(paper.motor, inductance=0.5),
             CurrentLoop(kp=0.0, kff=paper.motor.resistance),
@@ -74,9 +74,10 @@ def mapping_of(actuator: ActuatorModel) -> dict[str, Any] | None:
 def display_name(actuator: ActuatorModel, paper: DCMotorActuator | None = None) -> str:
     """Return the name under which an actuator is displayed.
 
-    The name is its label (see `display_label`) if it has one. Otherwise it is the motor of the
-    catalogue with the same numbers, apart from gear, loop and supply; for a current loop the
-    matching variation of `paper`, or `custom`; and for everything else the family.
+    This is its label (see `display_label`) if it has one. An actuator without a label is named
+    after the motor of the catalogue with the same values (gear, loop and supply are ignored) if it
+    is a drive; after the matching variation of `paper`, or `custom`, if it is a current loop; and
+    otherwise after its family.
     """
     kind, known = type(actuator), {}
     if kind is DCMotorActuator:
@@ -118,7 +119,7 @@ def set_display_name(actuator: ActuatorModel, label: str) -> Any:
 
 
 def is_family(value: Any) -> bool:
-    """Return True for a class of actuators, which stands for an actuator with default fields."""
+    """Return True for an actuator class, which as a setting selects its default fields."""
     return isinstance(value, type) and issubclass(value, ActuatorModel)
 
 
@@ -176,7 +177,7 @@ def resolve(actuator: Any, paper: DCMotorActuator | None, owner: str) -> Any:
             actuator; with a `label`: its display name), or None (ideal). Files may be given as a
             `pathlib.Path`.
         paper: the actuator that the names in `NAMED` vary; None if there is none.
-        owner: description of the owner of the actuator, for messages.
+        owner: description of the task or environment that gets the actuator, for messages.
 
     Raises:
         ValueError: unknown name or field, or a value out of bounds.
@@ -208,8 +209,8 @@ def resolve(actuator: Any, paper: DCMotorActuator | None, owner: str) -> Any:
     if actuator in NAMED:
         if paper is None:
             raise ValueError(
-                f"actuator = {actuator!r}: a variation of the paper's actuator, but {owner} has"
-                f" none; known names: {', '.join(FAMILIES)}"
+                f"actuator = {actuator!r}: is a variation of the paper's actuator, but {owner} has"
+                f" no such actuator; known names: {', '.join(FAMILIES)}"
             )
         return NAMED[actuator][1](paper)
     if actuator not in FAMILIES and Path(actuator).suffix in _FILES:
@@ -274,8 +275,8 @@ def _from_file(path: Path, paper: DCMotorActuator | None, owner: str) -> Any:
             and Path(str(_read(named_file)[0].get("name"))).suffix in _FILES
         ):
             raise ValueError(
-                f"name = {fields['name']!r}: must be an actuator's name, or a file that names no"
-                " other"
+                f"name = {fields['name']!r}: must be an actuator's name, or a file that does not"
+                " name another file"
             )
         with allow_imports_from_files():
             actuator = resolve(fields, paper, owner)
@@ -332,7 +333,7 @@ def override_actuator(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
         return base
     if isinstance(base, Ideal):
         raise ValueError(
-            "the ideal actuator has no motor and no controller whose fields could be set: name"
+            "the ideal actuator has no motor and no controller, and so no fields to set: name"
             " another actuator, such as paper"
         )
     if family != family_name(kind):
@@ -379,10 +380,10 @@ def _related_family(family: str, kind: Any) -> Any:
     related = find_family(family)
     if not (issubclass(related, kind) or issubclass(kind, related)):
         raise ValueError(
-            f"family = {family!r}: cannot be set over an actuator of the family"
-            f" {family_name(kind)!r}, which has different fields. Name an actuator of a related"
-            f" family, or specify all fields of the {family!r} without a name. Motors of `codrl-mj"
-            " motor list` and of datasheets are drives, which can become servos"
+            f"family = {family!r}: cannot replace the family {family_name(kind)!r}, which has"
+            f" different fields. Name an actuator of a related family, or leave out the name and"
+            f" specify all fields of the {family!r}. Motors of `codrl-mj motor list` and of"
+            " datasheets are drives, which can become servos"
         )
     return related
 
@@ -417,8 +418,8 @@ def check_same_family(actuators: Sequence[ActuatorModel]) -> Family:
     if len(kinds) > 1:
         names = ", ".join(sorted(kind.__name__ for kind in kinds))
         raise ValueError(
-            f"actuators of several families ({names}): the actuators of one environment must be"
-            " of one"
+            f"actuators of several families ({names}): all actuators of an environment must have"
+            " the same family"
         )
     family: Family = kinds.pop()
     check_family(family)

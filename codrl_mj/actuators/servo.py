@@ -31,14 +31,14 @@ class ServoLoop(Checked):
     controls: str = choice("position", "position", "velocity")
     """Controlled quantity, which is also what commands mean."""
     servo_rate: float = real(1e3, above=0.0, unit="Hz")
-    """Sample rate [Hz] of these loops, > 0; the drive's `sample_rate` must be a multiple of it. Of
-    it and the rate of the mechanical step, one must be a multiple of the other.
+    """Sample rate [Hz] of these loops, > 0; it must divide the drive's `sample_rate`, and be a
+    multiple or a divisor of the mechanical step's rate.
     """
     position_gain: float = real(20.0, above=0.0, unit="1/s")
     """Commanded speed [rad/s] for a position error of 1 rad, > 0."""
     velocity_gain: float = real(0.1, above=0.0, unit="N*m*s/rad")
-    """Torque [N*m] for a speed error of 1 rad/s, > 0: for a bandwidth f, 2*pi*f times the total
-    inertia with the rotor's.
+    """Torque [N*m] for a speed error of 1 rad/s, > 0. For a bandwidth f, use 2*pi*f times the total
+    inertia at the output, including the rotor's.
     """
     velocity_integral_gain: float = real(0.0, minimum=0.0, unit="1/s")
     """Torque that a speed error of 1 rad/s adds in a second, relative to `velocity_gain` [1/s], >=
@@ -67,7 +67,7 @@ class ServoLoop(Checked):
         unused = "inertia_feed_forward" if self.controls == "position" else "velocity_feed_forward"
         if getattr(self, unused) != 0.0:
             raise ValueError(
-                f"ServoLoop.{unused} = {getattr(self, unused):g}: must be 0 where controls ="
+                f"ServoLoop.{unused} = {getattr(self, unused):g}: must be 0 if controls ="
                 f" {self.controls!r}, which does not use it"
             )
 
@@ -113,7 +113,7 @@ class Signals(NamedTuple):
     saturated: float
     """1 if any of the following three signals is 1."""
     voltage_saturated: float
-    """1 if a drive's signal was 1 at any time of the step; the same holds for the next two."""
+    """1 if the voltage reached the supply's limit at any time of the step."""
     current_saturated: float
     """1 if the command exceeded `max_current` or `max_torque`."""
     temperature_saturated: float
@@ -260,8 +260,8 @@ class Servo(Drive):
             return self
         if not self.default_velocity_gain:
             raise ValueError(
-                "loop.velocity_gain is missing: must be given where a motor has no back-EMF; for a"
-                " bandwidth f it is 2*pi*f times the inertia at the output, the rotor's included"
+                "loop.velocity_gain is missing: it has no default if the motor has no back-EMF. For"
+                " a bandwidth f, set 2*pi*f times the inertia at the output, including the rotor's"
             )
         return self.replaced({"loop.velocity_gain": self.default_velocity_gain})
 
@@ -289,7 +289,7 @@ class Servo(Drive):
             limit, unit = min(no_load_speed * arm, loop.max_velocity * motor.arm_radius), "rad/s"
             if math.isinf(limit):
                 raise ValueError(
-                    "loop.max_velocity = inf: must be finite where a motor has no back-EMF"
+                    "loop.max_velocity = inf: must be finite if the motor has no back-EMF"
                 )
         return {loop.controls: Command(unit, self, 1.0 / arm, limit, fixed)}
 
@@ -302,10 +302,10 @@ class Servo(Drive):
         super().check(timestep)
         if not _rates_match(self.loop.servo_rate, self.controller.sample_rate, timestep):
             raise ValueError(
-                f"ServoLoop.servo_rate = {self.loop.servo_rate:g}: must be a multiple of the"
-                f" mechanical step's rate, {1.0 / timestep:g} Hz, or that a multiple of it, and the"
-                f" drive's sample_rate = {self.controller.sample_rate:g} Hz a multiple of both; the"
-                " step's own rate always fits"
+                f"ServoLoop.servo_rate = {self.loop.servo_rate:g}: must be a multiple or a"
+                f" divisor of the mechanical step's rate, {1.0 / timestep:g} Hz, and divide the"
+                f" drive's sample_rate = {self.controller.sample_rate:g} Hz; the mechanical step's"
+                " rate itself always fits"
             )
 
     @classmethod
@@ -337,17 +337,17 @@ class Servo(Drive):
             )
 
     def steps_per_sample(self, timestep: float) -> int:
-        """Return the number of mechanical steps [s] per sample of the outer loops, at least 1."""
+        """Return the number of mechanical steps per sample of the outer loops, at least 1."""
         return max(int(1.0 / (timestep * self.loop.servo_rate) + 0.5), 1)
 
     def loop_remedy(self, inertia: float) -> str:
         """Return a remedy for the outer loops' gains; see `ActuatorModel.loop_remedy`."""
         loop, at_joint = self.loop, inertia * self.motor.gear_ratio**2
         return (
-            f"It moves {at_joint:.3g} kg*m^2: for a bandwidth f loop.velocity_gain ="
-            f" {loop.velocity_gain:g} is 2*pi*f times that, f well below servo_rate ="
-            f" {loop.servo_rate:g} Hz, and position_gain = {loop.position_gain:g} well below"
-            " 2*pi*f."
+            f"The inertia at the joint is {at_joint:.3g} kg*m^2. For a bandwidth f, set"
+            f" loop.velocity_gain (now {loop.velocity_gain:g}) to 2*pi*f times this inertia, with f"
+            f" well below servo_rate = {loop.servo_rate:g} Hz; and set position_gain (now"
+            f" {loop.position_gain:g}) well below 2*pi*f."
         )
 
 

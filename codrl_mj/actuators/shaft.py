@@ -149,10 +149,15 @@ def estimate_external_acceleration(
 ) -> float:
     """Estimate the acceleration [rad/s^2] of the rotor by everything except its motor.
 
-    It is half the last step's observation and half the previous estimate. Without the averaging,
+    The estimate is the average of the last step's observation and the previous estimate. Otherwise,
     two joints that move each other, each with a stiff motor, would react to each other with a delay
-    of a step and oscillate. `change` is the rotor's change of speed [rad/s] in the step, `own` its
-    acceleration [rad/s^2] by the motor's torque.
+    of a step and oscillate.
+
+    Args:
+        timestep: duration of the last step [s].
+        change: change of the rotor's speed in that step [rad/s].
+        motor_acceleration: acceleration by the motor's torque in that step [rad/s^2].
+        external_acceleration: previous estimate [rad/s^2].
     """
     return 0.5 * (change / timestep - motor_acceleration) + 0.5 * external_acceleration
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
-from codrl_mj.actuators.model import ActuatorModel, Inputs, Nothing, UnstableError
+from codrl_mj.actuators.model import ActuatorModel, Empty, Inputs, UnstableError
 from codrl_mj.fields import real
 
 
@@ -24,9 +24,9 @@ class Signals(NamedTuple):
 def advance(
     parameters: Any,
     timestep: float,  # noqa: ARG001
-    state: Nothing,  # noqa: ARG001
+    state: Empty,  # noqa: ARG001
     inputs: Inputs,
-) -> tuple[Nothing, float, Signals]:
+) -> tuple[Empty, float, Signals]:
     """Clip the desired torque to the torque-speed line, and the line to `max_torque`.
 
     At speed w, full forward voltage gives stall_torque*(1 - w/no_load_speed), and full backward
@@ -40,7 +40,7 @@ def advance(
     lower = min(max(parameters.stall_torque * (-1.0 - ratio), -limit), limit)
     torque = min(max(inputs.desired_torque, lower), upper)
     saturated = 1.0 if torque != inputs.desired_torque else 0.0
-    return Nothing(), torque, Signals(lower, upper, saturated)
+    return Empty(), torque, Signals(lower, upper, saturated)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,8 +88,8 @@ class TorqueSpeed(ActuatorModel):
         if share >= 2.0:
             raise UnstableError(
                 f"stall_torque = {self.stall_torque:g} at no_load_speed = {self.no_load_speed:g}:"
-                f" on the line between them a step of {timestep:g} s takes {share:.3g} of the way"
-                f" to the no-load speed, must be < 2. It moves {inertia:.3g} kg*m^2. Shorten the"
+                f" a step of {timestep:g} s changes the speed by {share:.3g} times its distance to"
+                f" the no-load speed, must be < 2. The inertia is {inertia:.3g} kg*m^2. Shorten the"
                 f" step to less than {2.0 * timestep / share:.3g} s, or pass allow_unstable=True to"
                 " study it as it is"
             )

@@ -140,7 +140,9 @@ class DDPGConfig(ActorCriticConfig):
     (pendulum), () (car).
     """
     joint_units: tuple[int, ...] = positive_integers((256, 256))
-    """Units of the critic's joint hidden layers. The paper: 256-256 (pendulum), 64 (car)."""
+    """Units of the critic's hidden layers behind the merged state and action layers. The paper:
+    256-256 (pendulum), 64 (car).
+    """
 
     def _policy_arguments(self) -> dict[str, Any]:
         streams = {

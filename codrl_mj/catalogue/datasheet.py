@@ -103,7 +103,7 @@ class Datasheet:
     """Largest permissible temperature of the winding."""
 
     def __post_init__(self) -> None:
-        """Read every value once, so that an existing datasheet is always readable."""
+        """Parse every value, so that an invalid one raises an error at once."""
         if self.shaft not in (None, "motor", "output"):
             raise ValueError(f"datasheet.shaft = {self.shaft!r}: must be motor or output")
         self.readings()
@@ -185,8 +185,8 @@ _PHASE = (
 )
 _UNSUPPORTED = {
     "pole_pairs": (
-        "omit it: speeds are those of the rotor; if a maker prints electrical rpm, divide"
-        " them by it"
+        "omit it: speeds are those of the rotor; if electrical rpm are printed, divide"
+        " them by the number of pole pairs"
     ),
     "phase_resistance": f'{_PHASE}, resistance = "2 * 0.3 ohm"',
     "phase_inductance": f'{_PHASE}, inductance = "2 * 0.1 mH"',
@@ -194,7 +194,7 @@ _UNSUPPORTED = {
 
 
 def to_field_names(printed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return printed values by field names of `Datasheet`, from any case and other common names.
+    """Convert names of printed values, in any case and with common synonyms, to names of fields.
 
     Raises:
         ValueError: a name is unknown, or a field has two values.

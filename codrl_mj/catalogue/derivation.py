@@ -1,7 +1,7 @@
 """Derivation of a motor's parameters from its datasheet: rules, and checks of consistency.
 
-The motor is V = R*I + kE*w with torque kT*I. The gear transmits `gear_efficiency` of it, and
-friction is subtracted behind the gear, as in the simulation: without load it is
+The motor is V = R*I + kE*w with torque kT*I. The gear transmits the share `gear_efficiency` of this
+torque. Friction is subtracted behind the gear, as in the simulation, so without load it equals
 gear_efficiency*kT*I0. Source of the relations: maxon's *Key information on maxon DC and EC motors*;
 they are those of any textbook on DC motors.
 """
@@ -108,7 +108,7 @@ CHECKS = (
     (
         "speed_constant",
         "1 / back_emf_constant",
-        "two ways to print one number; rounding, or the one includes losses",
+        "two ways to print one number; rounding, or one of them includes losses",
     ),
     (
         "stall_current",
@@ -321,7 +321,7 @@ def derive(
         raise ValueError(
             f"datasheet.{worst.quantity} contradicts the rest by more than {tolerance:.0%}:"
             f" {worst}. Check the values and units of {sources}; raise tolerance, or pass"
-            " strict=False, if the maker does print them so"
+            " strict=False, if the manufacturer does print these values"
         )
     for name, field in PRINTED_NAMES.items():
         if field in printed:

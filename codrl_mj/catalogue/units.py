@@ -130,8 +130,8 @@ def parse_value(name: str, printed: Any, kind: Kind) -> Reading:
         )
     if re.search(r"(?i)\be-?rpm", unit):
         raise ValueError(
-            f"datasheet.{name} = {printed!r}: electrical speed is not that of the rotor; divide"
-            " by the pole pairs, write rpm"
+            f"datasheet.{name} = {printed!r}: is an electrical speed; divide it by the"
+            " number of pole pairs, and write rpm"
         )
     if not unit and kind.unit:
         raise ValueError(f"datasheet.{name} = {printed!r}: has no unit; {remedy}")
@@ -155,9 +155,15 @@ def to_si(
 ) -> Any:
     """Convert a number to the SI unit of its kind, or to SI base units for kind None.
 
-    The unit is spelled as in datasheets and logs. With `weights`, a mass stands for its weight if
-    only that makes sense: kg*cm, oz*in. The error explains the problem of the unit, `of` which
-    quantity it is, and leaves the remedy to the caller.
+    Args:
+        number: the number, or an array.
+        unit: its unit, spelled as in datasheets and logs.
+        kind: SI unit of the quantity; None for any quantity.
+        of: name of the quantity, for messages.
+        weights: read a mass as its weight if the dimension requires a force, as in kg*cm and oz*in.
+
+    Raises:
+        ValueError: the unit is unknown or does not fit; the caller adds the remedy.
     """
     if kind is not None and unit in (usual := _USUAL.get(kind, {})):
         return number * usual[unit]
@@ -185,7 +191,7 @@ def to_si(
     if any(name.endswith("hertz") for name in units) or (
         kind.startswith("rad") and not any(name.endswith(tuple(_ANGLES)) for name in units)
     ):
-        raise ValueError("turns or radians? Hz and 1/s are ambiguous")
+        raise ValueError("Hz and 1/s are ambiguous: turns or radians?")
     return quantity.to(kind or "dimensionless").magnitude
 
 

@@ -38,7 +38,7 @@ VERB_HELP: dict[str, tuple[str, str]] = {
     "report": ("Write a report of a run as one HTML file.", "runs/mine --out mine.html"),
     "motor": ("List off-the-shelf motors, show one, design its loop, choose one.", "list"),
     "advise": (
-        "Advise whether to train through an actuator or do something else.",
+        "Advise what to do about an actuator before you train.",
         "weak pendulum",
     ),
     "identify": ("Identify a motor from its bench logs.", "check swing.csv --columns time=t:s"),
@@ -84,8 +84,8 @@ VERBS = {
 """Words of every verb -> its module, which is imported when the verb is called, and its class."""
 _DESCRIPTION = (
     "Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor."
-    " Each verb has its own --help; -h omits the descriptions. --version prints the version;"
-    " --traceback shows where an error arose."
+    " Every verb has its own --help; -h prints a shorter help. --version prints the version;"
+    " --traceback prints the traceback of an error."
 )
 
 
@@ -201,10 +201,7 @@ def _run_verb(verb: Any) -> int:
 
 
 def _to_json_value(content: Any) -> Any:
-    """Convert a value to JSON types: objects become mappings, numbers that are not finite null.
-
-    JSON has no number for NaN and infinity.
-    """
+    """Convert a value to JSON types: objects to mappings, and NaN and infinity to null."""
     for method in ("as_mapping", "summary", "_asdict"):
         if hasattr(content, method):
             return _to_json_value(getattr(content, method)())
@@ -257,11 +254,11 @@ def _format_error(error: BaseException) -> str:
 
 @contextlib.contextmanager
 def _engine_warnings() -> Iterator[None]:
-    """Print MuJoCo's warnings as ours, each kind once; otherwise it would write MUJOCO_LOG.TXT.
+    """Print each kind of MuJoCo's warnings once, in our format, instead of in MUJOCO_LOG.TXT.
 
-    A handler that the user has installed is left in place. Two warnings are not shown: that a
-    simulation diverged, which ends in an error anyway, and that Gymnasium's cheetah model uses a
-    deprecated attribute.
+    A handler that the user has installed is left in place. Two warnings are not shown: a simulation
+    diverged, which ends in an error anyway; and Gymnasium's cheetah model uses a deprecated
+    attribute.
     """
     seen_kinds = {"Nan, Inf or huge value in ", "compiler attribute 'settotalmass' is deprecated"}
 
@@ -282,7 +279,10 @@ def _engine_warnings() -> Iterator[None]:
 
 
 def _show_each_once() -> Callable[..., None]:
-    """Return a `warnings.showwarning` that shows each text once, for every environment of a command warns anew."""
+    """Return a `warnings.showwarning` that shows each text once.
+
+    Otherwise, every environment that a command creates would repeat the same warning.
+    """
     shown = set()
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:

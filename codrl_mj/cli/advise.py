@@ -87,7 +87,7 @@ class Advise:
                 " --measure 5"
             )
         if self.measure is not None and self.measure < 2:
-            raise ValueError(f"--measure {self.measure}: must be >= 2, to have an interval")
+            raise ValueError(f"--measure {self.measure}: must be >= 2, or there is no interval")
         actuator_spec: Any = self.actuator
         if self.gear_ratio is not None or self.voltage is not None:
             motor = {} if self.gear_ratio is None else {"motor": {"gear_ratio": self.gear_ratio}}
@@ -119,7 +119,7 @@ class Advise:
             options = measurement_plan.loss_bounds(measurement_plan.grid.collect())
             measured = {"options": options, "verdict": decide(options)}
             _print_options(
-                f"Measured: {self.measure} policies of either kind, 50 episodes each", options
+                f"Measured: {self.measure} policies of each kind, 50 episodes each", options
             )
             more = " by more policies (--measure)" * (measured["verdict"] == "measure it")
             print_text(f"measured: {measured['verdict']}{more}")
@@ -144,7 +144,7 @@ def _print_advice(name: str, advice: Any) -> None:
             unit = (
                 AXES[loss.axis].unit.rpartition("[")[2].removesuffix("]").removeprefix("missing ")
             )
-            tested = ", ".join(dose.removeprefix(f"{loss.axis} ") for dose in loss.between)
+            tested = ", ".join(severity.removeprefix(f"{loss.axis} ") for severity in loss.between)
             cells = _loss_cells(loss.outcome, "at least " * loss.beyond)
             rows.append((loss.axis, f"{loss.severity:.3g}", unit, *cells, tested))
         label = "Losses of policies that were trained on ideal forces [shares of the task's span]"

@@ -54,12 +54,12 @@ class Export:
     episodes: int = 5
     """Number of episodes that are run for the contract's ranges and reference values."""
     seed: int = 0
-    """Seed of the first episode; the others count up from it."""
+    """Seed of the first episode; each further episode uses the next integer."""
     float64: bool = False
     """Compute with double instead of float in the C code."""
     limit: tuple[str, ...] = ()
-    """Largest safe magnitudes of observations, as arm_velocity=30 arm=1.8. Beyond them the board
-    gives the safety command. An angle that is observed as cos_arm and sin_arm is called arm.
+    """Largest safe magnitudes of observations, such as arm_velocity=30 arm=1.8. Beyond them the
+    board sends the safety command. An angle that is observed as cos_arm and sin_arm is called arm.
     """
     board: str | None = None
     """Board whose memory and speed are checked: arduino-uno, arduino-due, nucleo-f446re,
@@ -91,7 +91,7 @@ class Export:
             ("", "name", "unit", "range"),
             rows,
         )
-        weights = extract_network(subject.policy).size
+        num_weights = extract_network(subject.policy).size
         if contract.controller["loop"] is None and contract.actuators:
             reason = (
                 f"this policy commands a {env.action}"
@@ -99,7 +99,9 @@ class Export:
                 else "the motors have different loops, or none"
             )
             print(f"no current loop: {reason}")
-        written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
+        written = (
+            f"wrote {self.out}: policy.onnx, contract.json, controller.c ({num_weights} numbers)"
+        )
         names = env.task, *(family_name(type(entry)) for entry in env.actuators)
         print(
             f"{written}; try:"
@@ -121,8 +123,8 @@ class Export:
             return env
         if differing_fields := differences(trained_env.as_mapping(), env.as_mapping()):
             raise ValueError(
-                f"{', '.join(differing_fields)}: the environment that {subject.run} was trained in"
-                " is exported: leave the flags of the environment out; evaluate and board test take"
+                f"{', '.join(differing_fields)}: export uses the environment in which"
+                f" {subject.run} was trained: omit these flags; evaluate and board test accept"
                 " another --actuator"
             )
         return subject.env
@@ -150,9 +152,9 @@ class Test:
     target: str = "host"
     """Machine that runs the C code: host, or cortex-m4f."""
     episodes: int = 20
-    """Episodes, each from its own seed."""
+    """Number of episodes, each with a different seed."""
     seed: int = 0
-    """Seed of the first episode; the others count up from it."""
+    """Seed of the first episode; each further episode uses the next integer."""
     loop: bool = True
     """Let the C code also close the motors' current loop, sample by sample, if it has one."""
     actuator: str | None = None
@@ -285,11 +287,11 @@ class CheckLog:
 
 @dataclasses.dataclass(frozen=True)
 class RunBoard:
-    """Watch a real board at a serial port, or let it drive, and log its messages until any key.
+    """Watch a real board at a serial port, or let it drive, and log its messages to a file.
 
     Without --drive the board only reports its observations and the commands that it would give. The
     motor moves only with --drive, which ends by itself on an error, and always ends with the safety
-    command.
+    command. Any key ends the run.
 
     Example: codrl-mj board run furuta --port /dev/ttyACM0 --out swing.csv
     """

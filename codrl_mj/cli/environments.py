@@ -88,10 +88,11 @@ Actuators = Annotated[
     tyro.conf.arg(
         metavar="PATTERN=NAME",
         help=(
-            "Actuators of single motors, which override --actuator and take the same names. The"
-            " regular expression must match the whole name of the motor or of its joint. Patterns"
-            " joined by & put one motor behind several actuators of a joint. Or a YAML file of"
-            " patterns and actuators, as codrl-mj motor choose writes."
+            "Actuators of individual motors, which override --actuator and take the same names."
+            " PATTERN is a regular expression that must match the whole name of the motor or its"
+            " joint. Patterns joined by & give the model's actuators of one joint a common motor."
+            " Instead of pairs, a YAML file of patterns and actuators, as codrl-mj motor choose"
+            " writes, is also accepted."
         ),
     ),
 ]
@@ -102,8 +103,8 @@ _FAMILY_HELP = (
     " command is a position."
 )
 AS_TRAINED, AS_CONFIGURED = "as-trained", "as-configured"
-"""Values of --actuator that are no names: the actuator of the policy's training, and the actuator
-of the configuration file or run.
+"""Defaults of --actuator that do not name an actuator: the actuator of the policy's training, and
+the actuator of the configuration file or run.
 """
 
 
@@ -112,19 +113,19 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
 
     The flags of single actuator fields are those of the family that `--actuator` or
     `--actuator.family` names. The ideal family gets those of a current loop, so that each of them
-    is refused with a clear message. An actuator that cannot be built raises here, because its flags
-    would be unknown.
+    is refused with a clear message. If the actuator cannot be built, its flags are unknown, so this
+    function raises the error.
 
     Args:
         defaults: configuration with the default values.
         chosen: the two flags, as `scan_flags` returns them.
         task: the environment's name.
     """
-    world, all_names = defaults.source, (field.name for field in dataclasses.fields(EnvConfig))
+    source, all_names = defaults.source, (field.name for field in dataclasses.fields(EnvConfig))
     excluded = tuple(
         name
         for name in all_names
-        if name not in world.fields or name in ("task", "actuator", "options")
+        if name not in source.fields or name in ("task", "actuator", "options")
     )
     options = [
         (
@@ -135,7 +136,7 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
             ],
             value,
         )
-        for option, hint, text, value in world.option_flags(defaults)
+        for option, hint, text, value in source.option_flags(defaults)
     ]
     env_flags, family = (
         flag_dataclass(EnvConfig, defaults, excluded, options),
@@ -158,8 +159,8 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
         ],
         None,
     )
-    # The ideal actuator has no fields. Flags of a current loop let `override_actuator` explain why each
-    # of them is refused.
+    # The ideal actuator has no fields. It gets the flags of a current loop, so that
+    # `override_actuator` can explain why each of them is refused.
     actuator_flags = flag_dataclass(
         DCMotorActuator if issubclass(family, Ideal) else family, extra_fields=[family_field]
     )
@@ -170,7 +171,8 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
             Annotated[
                 actuator_flags,
                 tyro.conf.arg(
-                    name="actuator", help="Single fields, which override the named actuator."
+                    name="actuator",
+                    help="Individual fields, which override those of the named actuator.",
                 ),
             ],
             actuator_flags(),
@@ -182,7 +184,8 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
 def scan_flags(arguments: Sequence[str], *flag_names: str) -> argparse.Namespace:
     """Return the values of some flags, without parsing the others; None for those that are absent.
 
-    Added are `task`, `options` and `trust`. Other flags and their defaults depend on these values.
+    The result also has `task`, `options` and `trust`. The other flags and their defaults depend on
+    these values.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in (*flag_names, "task"):
@@ -191,7 +194,7 @@ def scan_flags(arguments: Sequence[str], *flag_names: str) -> argparse.Namespace
     parser.add_argument("--trust", action="store_true")
     try:
         chosen, _ = parser.parse_known_args(arguments)
-    # A flag without its value. The real parser raises a better message for it later.
+    # A flag has no value. The real parser reports it later, with a better message.
     except argparse.ArgumentError:
         chosen = argparse.Namespace(**dict.fromkeys((*flag_names, "task", "options")), trust=False)
     word_pairs = itertools.pairwise(["", *arguments])
@@ -225,9 +228,13 @@ def with_environment_flags(verb: Any, arguments: Sequence[str]) -> Any:
 
 
 def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> EnvConfig:
-    """Return the environment that a verb's flags describe; `known` has the default values.
+    """Return the environment that a verb's flags describe.
 
-    The flags are those of `environment_fields`.
+    Args:
+        verb: the parsed verb, with the flags of `environment_fields`.
+        task: the environment's name.
+        name: value of --actuator.
+        defaults: configuration with the default values.
     """
     is_default = name in (AS_TRAINED, AS_CONFIGURED)
     if (
@@ -240,11 +247,11 @@ def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> En
         ]
         if drawn_fields:
             warnings.warn(
-                f"{', '.join(drawn_fields)} of {name} are drawn from the ranges of the training"
-                f" instead of taken from {name}: for {name} as it is add --env.randomize None",
+                f"{', '.join(drawn_fields)} of {name} are drawn from the training's distributions:"
+                f" add --env.randomize None to use the values of {name}",
                 stacklevel=2,
             )
-    world, env_flags = find_source(task), dict(vars(verb.env))
+    source, env_flags = find_source(task), dict(vars(verb.env))
     names = [field.name for field in dataclasses.fields(EnvConfig) if field.name != "options"]
     fields = {name: env_flags.pop(name) for name in names if name in env_flags}
     fields |= {
@@ -252,7 +259,7 @@ def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> En
         for nested_part in ("disturbances", "joint")
         if nested_part in fields
     }
-    options = world.options_of(env_flags)
+    options = source.options_of(env_flags)
     patterns = _patterns(verb.actuators)
     fields["randomize"] = _ranges(fields["randomize"], name, patterns)
     actuators = (
@@ -262,7 +269,7 @@ def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> En
     )
     config = EnvConfig(task, actuators, options=options)
     if patterns:
-        config = EnvConfig(task, world.overlaid(config, patterns), options=options)
+        config = EnvConfig(task, source.overlaid(config, patterns), options=options)
     actuator_fields = _set_fields(verb.actuator_fields)
     overridden = {
         pattern: override_actuator(actuator, actuator_fields)
@@ -306,8 +313,8 @@ def _ranges(randomize: Any, actuator: str, patterns: Mapping[str, Any]) -> Any:
     ]:
         if Path(spec).suffix not in (".yaml", ".yml", ".json"):
             raise ValueError(
-                "--env.randomize identified: draws within the intervals of a file; --actuator is"
-                f" {spec!r}, must be one that `codrl-mj identify` wrote"
+                f"--env.randomize identified: needs the intervals of an actuator file: {spec!r}"
+                " must be a file that `codrl-mj identify` wrote"
             )
         ranges = {f"{prefix}{name}": text for name, text in identified_ranges(spec).items()}
         specs += [f"{name}={text}" for name, text in ranges.items() if name not in spec_names]

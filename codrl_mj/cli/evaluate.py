@@ -45,9 +45,9 @@ class Evaluate:
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
     actuator_name: ActuatorName = AS_TRAINED
     episodes: int = 50
-    """Number of episodes, each from its own seed."""
+    """Number of episodes, each with a different seed."""
     seed: int = 0
-    """Seed of the first episode; the others count up from it."""
+    """Seed of the first episode; each further episode uses the next integer."""
     stochastic: bool = False
     """Sample the actions instead of taking the most likely ones."""
     out: Path | None = None

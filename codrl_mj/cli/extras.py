@@ -1,4 +1,4 @@
-"""Name the optional dependencies that a missing module belongs to."""
+"""Names of the extras that install a missing module."""
 
 import importlib.metadata
 import re
@@ -29,8 +29,8 @@ def missing_module_message(error: ModuleNotFoundError) -> str:
         )
     names = ", ".join(f"'{extra}'" for extra in extras)
     return (
-        f"{module} is not installed. Each of the extras {names} installs it: pip install one, or"
-        " 'codrl-mj[all]'"
+        f"{module} is not installed. Each of the extras {names} installs it: pip install one of"
+        " them, or 'codrl-mj[all]'"
     )
 
 

@@ -23,16 +23,17 @@ Columns = Annotated[
     tyro.conf.arg(
         metavar="SIGNAL=COLUMN:UNIT,...",
         help=(
-            "Signals of the columns, as time=t:s,voltage=duty*vbus:V,current=i:mA,position=q:deg."
-            " Signals are voltage, current, position, velocity, torque, bus, duty, temperature and"
-            " command; formulas have + - * /, twos_complement(column,16),"
-            " sign_magnitude(column,11), unwrap(column,360), atan2(y,x), abs, sign, sqrt, column[0]"
-            " of a list: docs/identify_logs.md."
+            "Columns of the signals, such as"
+            " time=t:s,voltage=duty*vbus:V,current=i:mA,position=q:deg. Signals are voltage,"
+            " current, position, velocity, torque, bus, duty, temperature and command; formulas can"
+            " contain + - * /, twos_complement(column,16), sign_magnitude(column,11),"
+            " unwrap(column,360), atan2(y,x), abs, sign, sqrt, and column[0] of a list"
+            " (docs/identify_logs.md)."
         ),
     ),
 ]
 """Type of a verb's flag `--columns`."""
-_FILE = tyro.conf.arg(metavar="LOG", help="CSV, JSON (or .gz), Parquet.")
+_FILE = tyro.conf.arg(metavar="LOG", help="Log files: CSV, JSON (both also as .gz) or Parquet.")
 Logs = Annotated[tyro.conf.Positional[tuple[Path, ...]], _FILE]
 """Type of a verb's field for log files."""
 _STYLES = {"error": "red", "warning": "yellow", "info": ""}
@@ -68,7 +69,7 @@ class Identify:
     gear_efficiency, stribeck_friction, stribeck_speed) as the fields of a drive.
     """
     estimate: tuple[str, ...] = ()
-    """Parameters to fit that are otherwise taken as known, such as torque_gain."""
+    """Parameters to fit that are otherwise fixed, such as torque_gain."""
     friction: Literal["auto", "coulomb", "stribeck", "load", "both"] = "coulomb"
     """Viscous and Coulomb friction, or more terms; auto keeps terms that predict left-out logs
     better.
@@ -472,7 +473,7 @@ class SimulateLog:
         load, sampler = Load(**vars(self.load)), Sampler(**vars(self.sampler))
         log = simulate(drive, excitation, load, _sensors(self.sensor), sampler, self.seed)
         columns = write_log(self.out, log)
-        print(f"wrote {self.out}: {len(log.time)} rows; read it by --columns '{columns}'")
+        print(f"wrote {self.out}: {len(log.time)} rows; read it with --columns '{columns}'")
         return 0
 
 

@@ -32,8 +32,8 @@ class Changes:
     sample_rate: float | None = None
     """Samples per second of the current loop [Hz]; motors of the catalogue: 20000."""
     bandwidth: float | None = None
-    """Bandwidth [Hz] that the loop's gains are designed for, at most sample rate / (2 pi); 0:
-    0.0555 of the rate.
+    """Bandwidth [Hz] for which the gains are designed, at most sample rate / (2 pi); 0: 0.0555
+    times the sample rate.
     """
     voltage: float | None = None
     """Voltage of the supply [V]; motors of the catalogue: the nominal voltage, or 24."""
@@ -54,7 +54,7 @@ class Changes:
         if overrides.pop("not_delayed") == overrides["delayed"]:
             overrides["delayed"] = None
         if self.delayed and self.not_delayed:
-            raise ValueError("--delayed and --no-delayed: give one of them")
+            raise ValueError("--delayed and --no-delayed: use only one of them")
         return find_drive(name, **overrides)
 
 
@@ -88,7 +88,7 @@ class List:
     """
 
     sort: Literal[tuple(_LIST_COLUMNS)] = "name"  # type: ignore[valid-type]
-    """Order: names from A, numbers from the highest."""
+    """Order: names from A to Z, numbers descending."""
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
@@ -250,9 +250,9 @@ class Design:
     degrees is comfortable, 30 rings, 0 oscillates. A digital drive computes a voltage from one
     sample and applies it in the next (--delayed), and the hold costs another half sample, so that a
     larger bandwidth needs a higher sample rate. The margins include the delay and the hold. The
-    bandwidth is where the gain of the closed loop is -3 dB; with a delayed loop that overshoots it
-    is above the designed one. Settling time and overshoot are those of a small step of the
-    simulated drive.
+    reported bandwidth is the -3 dB frequency of the closed loop, which exceeds the designed
+    bandwidth if a delayed loop overshoots. Settling time and overshoot are those of a small step of
+    the simulated drive.
 
     Example: codrl-mj motor design quanser-qube-servo-2 --bandwidth 1000 --delayed --out motor
     """
@@ -324,8 +324,8 @@ class Step:
 
     For 20 ms the reference is larger than the current that the voltage can drive against the
     back-EMF; then it is smaller. Without anti-windup the controller's integral has grown in the
-    meantime and must unwind before the current falls (recovery). With clamping the integral stands
-    still, with back-calculation it follows the current that is possible.
+    meantime and must unwind before the current falls (recovery). Clamping stops the integral;
+    back-calculation makes it follow the achievable current.
 
     Example: codrl-mj motor step quanser-qube-servo-2 --out motor
     """
@@ -394,7 +394,7 @@ class Step:
 
 @dataclasses.dataclass(frozen=True)
 class New:
-    """Write a template file for a custom motor, to be filled in from its datasheet; docs/motors.md.
+    """Write a template for a custom motor, to be filled in from its datasheet (docs/motors.md).
 
     Example: codrl-mj motor new my_motor.toml
     """

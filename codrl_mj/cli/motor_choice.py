@@ -35,11 +35,12 @@ MotorOfRun = Annotated[
 
 @dataclasses.dataclass(frozen=True)
 class Feasible:
-    """Check before training whether a motor can do a task; docs/motors.md.
+    """Check before training whether a motor can do a task (docs/motors.md).
 
-    The last line is surely, it depends (on values that the datasheet lacks), try it, hopeless or
-    surely not. The exit status is 1 for the last two. Example: codrl-mj motor feasible
-    maxon-ec45-flat-50w pendulum --gear-ratio 20
+    The last line is the verdict: surely, it depends (on values that the datasheet lacks), try it,
+    hopeless or surely not. The exit status is 1 for the last two.
+
+    Example: codrl-mj motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20
     """
 
     name: Annotated[
@@ -149,10 +150,10 @@ class Choose:
     The exit status is 1 if none is suitable. Name custom motors (files) or motors of the catalogue
     beside the task; without any, all motors of the catalogue are ranked. Each keeps the gear of its
     datasheet, gets the best gear if it has none, or is judged with each of --gears. A motor is
-    suitable if motor feasible says surely, with the margin; the smallest is the one with the least
-    maximum mechanical power at its supply. For a run with several motors one is chosen for each of
-    them. --out also writes actuators.yaml, which train, evaluate and render take as --actuators
-    FILE.
+    suitable if the verdict of motor feasible is surely, with the margin; the smallest is the one
+    with the least maximum mechanical power at its supply. For a run with several motors one is
+    chosen for each of them. --out also writes actuators.yaml, which train, evaluate and render take
+    as --actuators FILE.
 
     Example: codrl-mj motor choose pendulum --top 5 --out chosen, codrl-mj motor choose a.toml
     b.toml pendulum, codrl-mj motor choose a.toml pendulum --gears 6.25 18.75 30, or codrl-mj motor
@@ -170,9 +171,9 @@ class Choose:
         ),
     ]
     top: int = 5
-    """Number of motors in the table; for unsuitable ones the reason is printed."""
+    """Number of motors in the table; the reasons against unsuitable ones are printed below it."""
     margin: float = 0.2
-    """Share of the voltage, the peak current and the continuous current that must be left."""
+    """Share of the voltage, the peak current and the continuous current to keep in reserve."""
     voltage: float | None = None
     """Voltage of the supply [V]; default: each motor's own."""
     max_current: float | None = None

@@ -32,7 +32,7 @@ AsJson = Annotated[
     tyro.conf.FlagCreatePairsOff,
     tyro.conf.arg(
         name="json",
-        help="Print JSON and nothing else: in SI units, or with the unit beside the number.",
+        help="Print only JSON, in SI units unless another unit is given beside the number.",
     ),
 ]
 """Type of a field whose verb returns the exit status and the content to print as JSON."""
@@ -100,7 +100,8 @@ def _raise_parse_error(event: Any, kind: Any, program: str) -> None:
                 else ""
             )
             raise ValueError(
-                f"{program} needs a verb: {hint}there are {choices}; {program} --help says more"
+                f"{program} needs a verb: {hint}verbs are {choices}; {program} --help"
+                " describes them"
             )
         case "MissingArgs":
             missing = [
@@ -185,8 +186,8 @@ def _argument_name(argument: Any) -> str:
     """Return the name of an argument for messages: its flag, or its name in capitals."""
     if argument.is_positional():
         return str(argument.field.intern_name.upper())
-    # A short name, such as --voltage, stands first; who typed the long one would look for it in
-    # vain.
+    # All names of a flag are shown. The short one, such as --voltage, comes first, and users who
+    # typed the long one would not recognize it.
     return "/".join(name for name in argument.lowered.name_or_flags if not name.startswith("--no-"))
 
 
@@ -197,7 +198,7 @@ def _expected_type(argument: Any) -> str:
 
 
 def normalize_arguments(arguments: Sequence[str]) -> list[str]:
-    """Return the words with 1e5 and 20:1 as plain numbers and FILE.py:NAME as module:NAME.
+    """Rewrite words: 1e5 and 20:1 as plain numbers, and FILE.py:NAME as module:NAME.
 
     If the line names a module of the present folder, or has `--trust`, that folder is appended to
     `sys.path`. Modules that only a file names are still refused without `--trust`.
@@ -233,8 +234,8 @@ def _module_name(file: Path, folder: Path) -> str:
     parts = path.relative_to(folder).parts if path.is_relative_to(folder) else ("..",)
     if not all(part.isidentifier() for part in parts):
         raise ValueError(
-            f"{file}: must be a file in the present folder {folder} or below it, in folders whose"
-            f" names are valid module names (letters, digits, _): change to {path.parent} and name"
-            f" {file.name}"
+            f"{file}: must be in the present folder {folder} or below it, and the names of the"
+            " file and its folders must be valid module names (letters, digits, _); otherwise"
+            f" change to {path.parent} and name {file.name}"
         )
     return ".".join(parts)

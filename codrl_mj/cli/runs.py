@@ -28,7 +28,7 @@ class Runs:
         tyro.conf.Positional[Path], tyro.conf.arg(help="Folder to search, with its subfolders.")
     ] = Path("runs")
     sort: Literal[SORT_KEYS] = "name"  # type: ignore[valid-type]
-    """Order of the list: names from A, numbers and times from the highest."""
+    """Order of the list: names from A to Z, numbers and times descending."""
     compare: tuple[Path, ...] = ()
     """Two or more run folders to compare instead of listing."""
     out: Path | None = None
@@ -111,7 +111,7 @@ def _print_comparison(comparison: Comparison) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Data:
-    """List published measurements of real motors, or download a data set: docs/identify.md.
+    """List published measurements of real motors, or download a data set (docs/identify.md).
 
     codrl_mj does not contain the data: files are downloaded from the authors' sites and checked by
     their digests.
@@ -158,7 +158,7 @@ class Cache:
     """Show or clear the cache of compiled code, which saves seconds in each process.
 
     CODRL_MJ_CACHE names another folder; CODRL_MJ_CACHE=off disables the cache. Outdated code is
-    never used, so that the cache need not be cleared: docs/engine.md.
+    never used, so you need not clear the cache (docs/engine.md).
 
     Example: codrl-mj cache --clear
     """

@@ -62,11 +62,11 @@ class Render(EpisodeVerb):
     height: int = 480
     """Height of the scene [px], even."""
     camera: str = "fixed"
-    """Camera of the model. Tasks have fixed and close; in other models fixed is the environment's
-    default.
+    """Name of a camera in the model. Tasks have `fixed` and `close`; for other environments `fixed`
+    selects the default camera.
     """
     pretty: bool = False
-    """Shadows, reflections and multisampling: slower."""
+    """Render with shadows, reflections and multisampling, which is slower."""
     motor: str | None = None
     """Name of the motor whose torque and voltage are plotted; default: the first."""
 
@@ -181,7 +181,7 @@ class LiveView(EpisodeVerb):
             ):
                 raise RuntimeError(
                     "--native needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set:"
-                    " leave it out to see the simulation in a browser, also through ssh -L"
+                    " omit it to see the simulation in a browser, also through ssh -L"
                     " 8080:localhost:8080"
                 )
         else:
@@ -244,7 +244,7 @@ class LiveView(EpisodeVerb):
 class Report:
     """Write a report of a run as one HTML file: learning, evaluation, a filmed episode with plots.
 
-    Several runs are shown side by side. Of unfinished and damaged runs the readable parts are
+    Several runs are shown side by side. For unfinished and damaged runs, the readable parts are
     shown.
 
     Example: codrl-mj report runs/cartpole-ppo-weaker-0 --out balance.html
@@ -264,7 +264,7 @@ class Report:
     film: bool = True
     """Film the episode."""
     replay: bool = False
-    """Also show the episode in 3D, on the same clock: 0.7 MB more."""
+    """Also show the episode in 3D, synchronized with the plots, which adds 0.7 MB."""
     certificate: Path | None = None
     """A certificate.json, or its folder, to summarize; default: the one in a run folder, if any."""
     trust: Trust = False

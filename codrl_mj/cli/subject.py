@@ -17,14 +17,14 @@ from codrl_mj.tasks import TASKS
 
 @dataclasses.dataclass(frozen=True)
 class Subject:
-    """A policy and what is known of its training."""
+    """A policy, with the known facts about its training."""
 
     policy: Any
     """Policy that chooses the actions."""
     env: EnvConfig
-    """Environment of its training, as far as it is known."""
+    """Environment of its training; unknown settings have their defaults."""
     agent: str
-    """Agent that was trained, as far as it is known; otherwise the kind of policy."""
+    """Agent that was trained; the class of the policy if the agent is unknown."""
     run: Path | None = None
     """Run folder of the training; None if there is none."""
 
@@ -33,8 +33,8 @@ class Subject:
         if self.run is None:
             from codrl_mj.runs.policies import check_spaces
 
-            # The bounds of forces are the task's; those of other commands may be another motor's on
-            # purpose.
+            # The task sets the bounds of forces. The bounds of other commands depend on the motor,
+            # and an evaluation may use another motor on purpose.
             check_spaces(self.policy, env, exact=env.action == "force")
         # A run folder stores these settings, so every difference is an error. Without one only the
         # spaces can be compared.
@@ -43,7 +43,7 @@ class Subject:
                 flag = f"--env.{name.replace('_', '-')}"
                 raise ValueError(
                     f"{flag} = {value!r}: the policy of {self.run} was trained with {trained!r} and"
-                    f" works only with that: leave {flag} out, or train a policy with it"
+                    f" works only with that: omit {flag}, or train a policy with it"
                 )
 
 
@@ -91,13 +91,14 @@ class Source:
     ] = False
 
     def load(self, path: Path) -> Subject:
-        """Return the policy of a run folder, of a folder with only a policy, or of a zip of SB3."""
+        """Load the policy of a run folder, of a folder with only a policy, or of a zip of SB3."""
         from codrl_mj.runs.policies import load_policy, load_sb3_zip
         from codrl_mj.training.folder import BEST, load_config, resume_command
 
         if self.normalize is not None and path.suffix != ".zip":
             raise ValueError(
-                f"--normalize {self.normalize}: {path} is no zip of Stable-Baselines3: leave it out"
+                f"--normalize {self.normalize}: {path} is not a Stable-Baselines3 zip: omit"
+                " the flag"
             )
         is_policy_only = path.suffix == ".zip" or (
             (path / "policy.json").exists() and not (path / CONFIG).exists()
@@ -106,23 +107,22 @@ class Source:
             config = load_config(path, self.trust)
             if self.task not in (None, config.task):
                 raise ValueError(
-                    f"--task {self.task}: {path} was trained for {config.task}: leave --task out"
+                    f"--task {self.task}: {path} was trained for {config.task}: omit --task"
                 )
             if self.agent not in (None, config.agent.name, config.agent.registry_name()):
                 raise ValueError(
-                    f"--agent {self.agent}: {path} was trained by {config.agent.name}: leave"
-                    " --agent out"
+                    f"--agent {self.agent}: {path} was trained by {config.agent.name}: omit --agent"
                 )
             if self.which == "last" and not finished(path):
                 raise FileNotFoundError(
                     f"{path} is not finished and has no last policy yet: continue it with"
-                    f" {resume_command(path)}, or take its best one so far with --which best"
+                    f" {resume_command(path)}, or use its best policy so far with --which best"
                 )
             policy = load_policy(path / BEST if self.which == "best" else path, self.trust)
             return Subject(policy, config.env, config.agent.registry_name(), path)
         if self.which == "best":
             raise ValueError(
-                f"--which best: {path} is no run folder and has a single policy: leave --which out"
+                f"--which best: {path} is not a run folder and has a single policy: omit --which"
             )
         if self.task is None:
             raise ValueError(f"{path} does not contain its task: name it with --task")
@@ -145,7 +145,8 @@ def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig, str]:
     if not (is_random := is_source_name(verb.subject)) and not Path(verb.subject).exists():
         hint = did_you_mean(verb.subject, TASKS)
         raise FileNotFoundError(
-            f"no run configuration at {verb.subject}/{CONFIG}: {hint}It is no run and no task"
+            f"no run configuration at {verb.subject}/{CONFIG}: {hint}It is neither a run"
+            " folder nor a task"
         )
     subject = (
         Subject(None, EnvConfig(verb.subject), "")

@@ -34,7 +34,7 @@ def print_table(
     styles: Sequence[str] = (),
     **table_options: Any,
 ) -> None:
-    """Print a table of plain texts, not of markup, or of rich's renderables.
+    """Print a table; texts are printed as they are, without rich's markup.
 
     Args:
         title: text above the table.
@@ -65,9 +65,10 @@ def print_table(
 
 
 def format_number(value: Any, digits: int = 3) -> str:
-    """Format a number with a number of digits; – if there is none; a tuple with its interval.
+    """Format a number with some significant digits, and – for None or NaN.
 
-    A mean or a median with its interval is a tuple or a mapping. Thousands are shown whole.
+    A tuple or mapping of a mean or median and its interval becomes "mean [low, high]". Numbers from
+    1,000 to a million are shown without decimals.
     """
     if isinstance(value, Mapping | tuple):
         middle, *ends = (
@@ -89,7 +90,7 @@ def progress_bar(*columns: str) -> Any:
 
     Each text is on one line, and empty while its numbers are unknown. If all do not fit on a line,
     the bar and the description are shortened. The display goes to standard error, and is disabled
-    if that is no terminal.
+    if that is not a terminal.
     """
     from rich.progress import (
         BarColumn,

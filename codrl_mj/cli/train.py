@@ -50,7 +50,7 @@ def train_verb(arguments: list[str]) -> Any:
         try:
             find_source(arguments[0])
         except ValueError as error:
-            hint = "for an environment of Gymnasium give its id, such as HalfCheetah-v5"
+            hint = "name an environment of Gymnasium by its id, such as HalfCheetah-v5"
             raise ValueError(f"{error}; {hint}") from None
     base = _base_config(chosen)
     resuming = chosen.resume is not None
@@ -85,7 +85,7 @@ def train_verb(arguments: list[str]) -> Any:
                 tyro.conf.arg(
                     help=(
                         "Source of the defaults: `default` (ours), `paper` (as printed),"
-                        " `repaired` (the paper's, with the settings changed that make it fail),"
+                        " `repaired` (the paper's, except for those that make training fail),"
                         " or `fast` (ours, for the shortest training)."
                     )
                 ),
@@ -115,7 +115,7 @@ def train_verb(arguments: list[str]) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train an agent through an actuator and leave a run folder.
+    """Train an agent through an actuator, and write a run folder.
 
     The folder gets the resolved configuration, tables of episodes and progress, checkpoints, the
     best and the last policy (safetensors and JSON), an evaluation and the learning curve. Ctrl-C
@@ -123,7 +123,7 @@ class Train:
 
     Example: codrl-mj train cartpole --actuator weaker --env.center-radius 0.1 --out
     runs/through-weaker, and after an interruption codrl-mj train --resume runs/through-weaker.
-    Other environments go by their Gymnasium ids:
+    Name other environments by their Gymnasium ids:
     codrl-mj train HalfCheetah-v5 --actuators 'b.*=maxon-ec45-flat-50w' 'f.*=lag'
     """
 
@@ -135,8 +135,8 @@ class Train:
     out: Path | None = None
     """Run folder to create; default: runs/TASK-AGENT-ACTUATOR-SEED."""
     resume: Path | None = None
-    """Run folder of an interrupted training, to continue from its last checkpoint to the same
-    result as without the interruption. Needs no other flags.
+    """Run folder of an interrupted training, which continues from its last checkpoint. The result
+    is the same as without the interruption. No other flags are needed.
     """
     accept_changes: bool = False
     """Continue even if the code or a package has changed since the run was started."""
@@ -147,7 +147,7 @@ class Train:
     tensorboard: bool = True
     """Write events for TensorBoard, if it is installed."""
     wandb: str | None = None
-    """Weights & Biases project to report to, in addition."""
+    """Weights & Biases project that also gets the reports."""
     as_json: AsJson = False
     for_line = staticmethod(train_verb)
 
@@ -164,8 +164,7 @@ class Train:
             )
         if self.resume is not None and self.out not in (None, self.resume):
             raise ValueError(
-                f"--out {self.out}: a run continues in its own folder, {self.resume}: leave"
-                " --out out"
+                f"--out {self.out}: a run continues in its own folder, {self.resume}: omit --out"
             )
         config = dataclasses.replace(
             self.base,
@@ -229,9 +228,9 @@ def _result_mapping(run: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None]:
-    """Show a bar for each training while the block runs, updated from the files of the run folders.
+    """Show a progress bar for each training while the block runs.
 
-    Other processes may write them too.
+    The bars follow the progress files in the run folders, which other processes may write.
     """
     columns = (
         "{task.completed:,}/{task.total:,} {task.fields[unit]}",
@@ -293,15 +292,15 @@ def _base_config(chosen: argparse.Namespace) -> TrainConfig:
         if chosen.settings is not None or chosen.agent not in (None, stored.agent.registry_name()):
             raise ValueError(
                 f"{chosen.resume} is a training of {stored.agent.name} and continues unchanged:"
-                " leave --agent and --settings out"
+                " omit --agent and --settings"
             )
         return stored
     if chosen.config is not None:
         overrides = {name: getattr(chosen, name) for name in ("task", "agent", "settings")}
         return read_config(Path(chosen.config), chosen.trust, **overrides)
     task = chosen.task or "cartpole"
-    world = find_source(task)
-    options = world.options_of({"options": chosen.options}) if chosen.options else {}
+    source = find_source(task)
+    options = source.options_of({"options": chosen.options}) if chosen.options else {}
     agent = (
         chosen.agent
         if chosen.agent in AGENTS or ":" in str(chosen.agent)
@@ -309,5 +308,5 @@ def _base_config(chosen: argparse.Namespace) -> TrainConfig:
     )
     settings = chosen.settings if chosen.settings in SETTINGS else "default"
     return TrainConfig.preset(
-        task, agent, settings, world.default_actuator, {"options": options} if options else {}
+        task, agent, settings, source.default_actuator, {"options": options} if options else {}
     )

@@ -19,8 +19,10 @@ from codrl_mj.validation import GROUPS, Certificate, Check, MutationResult
 class Validate:
     """Certify that the port is correct: every check with its oracle, tolerance and worst case.
 
-    The exit status is 1 if a check fails. Example: codrl-mj validate cartpole --out certificate, or
-    codrl-mj validate --model robot.xml (your own model with our motors).
+    The exit status is 1 if a check fails.
+
+    Example: codrl-mj validate cartpole --out certificate, or codrl-mj validate --model robot.xml
+    (your own model with our motors).
     """
 
     tasks: Annotated[
@@ -95,7 +97,7 @@ def print_checks(checks: Sequence[Check], title: str = "MuJoCo against Gymnasium
     )
     for check in checks:
         if not check.passed:
-            fault_text = f". Whose fault: {check.fault}" if check.fault else ""
+            fault_text = f". Likely cause: {check.fault}" if check.fault else ""
             print_text(
                 f"{check.name}, against {check.oracle}: FAILED at {check.where}{fault_text}",
                 style="red",

@@ -27,7 +27,7 @@ from codrl_mj.engine.families import (
     family_size,
     is_compiled,
 )
-from codrl_mj.engine.hill import compiled_hill
+from codrl_mj.engine.hill import hill_callbacks
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import callback, entry_address, f64, internal
 from codrl_mj.engine.model_access import command, is_disabled, output_inertia, user_address
@@ -60,7 +60,7 @@ def _is_ours(model: int, actuator: int) -> bool:
 
 
 @functools.cache
-def compiled_motors() -> dict[str, Any]:
+def motor_callbacks() -> dict[str, Any]:
     """Return the motors' callbacks by MuJoCo's names, in the form that its setters accept.
 
     `control` advances the actuators; `act_bias` returns the torque that they deliver. They are
@@ -118,8 +118,8 @@ def compiled_motors() -> dict[str, Any]:
 # -- installation of the callbacks, which never replaces those of other libraries --
 
 _GROUPS: dict[str, tuple[tuple[str, ...], Callable[[], dict[str, Any]], str]] = {
-    "motor": (("control", "act_bias"), compiled_motors, "actuator='ideal' or physics='analytic'"),
-    "hill": (("passive",), compiled_hill, "physics='analytic'"),
+    "motor": (("control", "act_bias"), motor_callbacks, "actuator='ideal' or physics='analytic'"),
+    "hill": (("passive",), hill_callbacks, "physics='analytic'"),
 }
 """Group -> names of its callbacks, as in `mujoco.set_mjcb_NAME`; function that returns the compiled
 callbacks by name; and settings of an environment that does not need them.

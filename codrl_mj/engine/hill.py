@@ -76,8 +76,8 @@ def _move_geoms(model: int, data: int, body: int, height: float, slope: float) -
 
 
 @functools.cache
-def compiled_hill() -> dict[str, Any]:
-    """Return the hill's callback by MuJoCo's name, as `compiled_motors` does for motors."""
+def hill_callbacks() -> dict[str, Any]:
+    """Return the hill's callback by MuJoCo's name, as `motor_callbacks` does for motors."""
 
     @cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
     def passive(model: int, data: int) -> None:

@@ -203,7 +203,7 @@ def _parse_number(text: str, word: str) -> bool | int | float:
         raise ValueError(f"{text!r}: {word!r} must be a number") from None
 
 
-def split_path(path: str) -> tuple[str, str]:
+def split_pattern(path: str) -> tuple[str, str]:
     """Split a path into its pattern, which may be empty, and its field."""
     pattern, _, field = ("", "", path) if path.startswith(MODEL) else path.rpartition(":")
     return pattern, field
@@ -234,7 +234,7 @@ def parse_randomize(randomize: Any) -> dict[str, Distribution]:
     ):
         if path in distributions:
             raise ValueError(f"randomize: {path} is named twice: give it one distribution")
-        pattern, field = split_path(path)
+        pattern, field = split_pattern(path)
         try:
             if pattern and field.startswith(MODEL):
                 raise ValueError(f"{field} is the model's, not a motor's: leave {pattern!r} out")

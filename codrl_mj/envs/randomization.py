@@ -24,7 +24,7 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.engine.reading import actuators_sharing_motor, check_shafts
 from codrl_mj.engine.specs import match_pattern, matchable_names
-from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
+from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_pattern
 from codrl_mj.fields import did_you_mean
 from codrl_mj.physics.variation import (
     Variation,
@@ -101,7 +101,7 @@ class Randomization:
         """Family of each motor of a simulation."""
         self.columns = [
             {
-                column: split_path(path)[1]
+                column: split_pattern(path)[1]
                 for column, (path, motor_indices) in enumerate(matched.items())
                 if motor_index in motor_indices
             }
@@ -284,7 +284,7 @@ class RandomizationState:
         for (path, field_type), value in zip(
             self.randomization.types.items(), self._values[row], strict=True
         ):
-            pattern, field = split_path(path)
+            pattern, field = split_pattern(path)
             (report.setdefault(pattern, {}) if pattern else report)[field] = (
                 np.nan if np.isnan(value) else field_type(value)
             )
@@ -429,7 +429,7 @@ def _match_motors(
     ]
     matched: dict[str, list[int]] = {}
     for path, distribution in distributions.items():
-        pattern, field = split_path(path)
+        pattern, field = split_pattern(path)
         try:
             all_motors = list(range(len(indices)))
             motor_indices = (
@@ -446,7 +446,7 @@ def _match_motors(
                 model_name,
             )
             if any(
-                split_path(other_path)[1] == field and {*motor_indices} & {*other_indices}
+                split_pattern(other_path)[1] == field and {*motor_indices} & {*other_indices}
                 for other_path, other_indices in matched.items()
             ):
                 raise ValueError("it is drawn by another pattern, too")
@@ -536,7 +536,7 @@ def _check_motor_field(
 def _type_of_field(family: Family, path: str) -> type:
     """Return the type of a family's field: float, int or bool."""
     value: Any = family()
-    for part in split_path(path)[1].split("."):
+    for part in split_pattern(path)[1].split("."):
         value = getattr(value, part, None)
     return type(value) if isinstance(value, int) else float
 
@@ -547,7 +547,7 @@ def _depends_on(quantity: Callable[[ActuatorModel], Any], motor: ActuatorModel, 
     A product with a factor of 0 hides the dependence, so it is also tried with all fields at 2.
     """
     family: Family = type(motor)
-    fields, field = field_paths(family), split_path(path)[1]
+    fields, field = field_paths(family), split_pattern(path)[1]
     for values in (field_values(motor), (2.0,) * len(fields)):
         changed = [value + (name == field) for name, value in zip(fields, values, strict=True)]
         if quantity(from_array(family, values)) != quantity(from_array(family, changed)):

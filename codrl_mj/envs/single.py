@@ -15,7 +15,7 @@ from codrl_mj.envs.randomization import RandomizationState, apply_to_simulation
 from codrl_mj.envs.setup import ResolvedEnv, unwrap_single
 from codrl_mj.envs.snapshots import check_snapshot, encode_name, generator_from_words
 from codrl_mj.physics import MujocoPhysics, SimulationConfig, signal_names, trace_names
-from codrl_mj.physics.offscreen import OffscreenRenderer, Window, check_view
+from codrl_mj.physics.offscreen import DisplayWindow, OffscreenRenderer, check_view
 from codrl_mj.physics.streams import generator_words
 from codrl_mj.tasks import Task
 
@@ -88,7 +88,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         self._renderer: OffscreenRenderer | None = None
-        self._window: Window | None = None
+        self._window: DisplayWindow | None = None
         self._fallback_scene: Any = None
         if render_mode is not None:
             check_view(self._scene().scene[0], width, height, camera)
@@ -314,7 +314,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         if self.render_mode == "rgb_array":
             return image
         if self._window is None:
-            self._window = Window(image.shape[1], image.shape[0])
+            self._window = DisplayWindow(image.shape[1], image.shape[0])
         self._window.show(image, self.metadata["render_fps"])
         return None
 

@@ -160,7 +160,7 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
 
     Args:
         path: the file.
-        trust: whether to import the module of a custom actuator, which executes it.
+        trust: import, and thereby execute, the module of a custom actuator.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -238,7 +238,7 @@ class _Recording:
         self._rewards.append(float(reward))
         self._traces.append(self._recorder.trace)
         self._signals.append(info)
-        # The recording is concatenated at the end, which needs its size again.
+        # The recording is concatenated at the end, which needs the same amount of memory again.
         if (steps := len(self._traces)) % _STEPS_BETWEEN_CHECKS == 0:
             label = f"an episode of {steps:,} steps, which does not end"
             check_memory(steps * self._traces[-1].nbytes, label, "lower max_episode_steps")

@@ -165,7 +165,7 @@ def evaluate(
         SimulationDivergedError: a simulation has a value that is not finite.
     """
     # The task defines the bounds of forces. The bounds of other commands depend on the motor, and
-    # the policy may be tested on another one on purpose.
+    # a policy may be tested on another motor on purpose.
     check_spaces(policy, env, exact=env.action == "force")
     recorded_episodes = run_episodes(policy, env.make, episodes, seed, deterministic, on_step)
     conditions = {"env": env.as_mapping(), "seed": seed, "deterministic": deterministic}

@@ -7,9 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 MIN_CORRELATION = 0.5
-"""Correlation below which no delay is returned: it explains less than a quarter of the variance."""
+"""Smallest correlation for which a delay is returned; it explains a quarter of the variance."""
 EQUAL_CORRELATION = 0.99
-"""Share of the highest peak above which peaks are equal: a periodic signal has one per period."""
+"""Share of the highest peak above which peaks count as equal.
+
+A periodic signal has such a peak in each period; the first is the delay.
+"""
 
 
 class Interval(NamedTuple):
@@ -150,7 +153,7 @@ def delay(
         return None
     # argmax of a boolean array is the index of its first True.
     peak = int(np.argmax(heights >= EQUAL_CORRELATION * heights.max()))
-    # Rounding to 9 digits removes the error of the Fourier transform, which is smaller.
+    # Rounding to 9 digits removes the smaller numerical error of the Fourier transform.
     return max(round(peak + float(offsets[peak]), 9), 0.0) * timestep
 
 

@@ -208,7 +208,9 @@ class Identified:
     logs: tuple[str, ...]
     """Names of the logs."""
     rig: str
+    """Load on the output: `pendulum`, `free` or `load`."""
     friction: str
+    """Friction model of the fit: `coulomb`, `stribeck`, `load` or `both`."""
     driven_by: str | None
     """Input of the shaft in the fit; None if only the winding was fitted."""
     delays: Mapping[str, float]

@@ -256,8 +256,8 @@ def check_view(model: mujoco.MjModel, width: int, height: int, camera: str) -> N
         )
 
 
-class Window:
-    """Window that shows images one after another, no faster than a frame rate."""
+class DisplayWindow:
+    """On-screen window that shows images one after another, no faster than a frame rate."""
 
     def __init__(self, width: int, height: int) -> None:
         """Open a window for images of this size [px]."""

@@ -69,15 +69,18 @@ def _umask() -> int:
 
 
 def check_writable(folder: Path) -> None:
-    """Raise if `folder` cannot be written to, before hours of work; nothing is created."""
+    """Raise if `folder` cannot be written to.
+
+    Verbs call it before hours of work. It creates nothing.
+    """
     existing = folder.absolute()
     while not existing.exists():
         existing = existing.parent
     if not existing.is_dir():
         raise NotADirectoryError(f"cannot write to {folder}: {existing} is not a folder")
     try:
-        # Permission bits do not suffice (root, read-only file systems), so a nameless file is
-        # written.
+        # Permission bits are not reliable (root, read-only file systems), so a temporary file
+        # without a name is created.
         tempfile.TemporaryFile(dir=existing).close()
     except OSError as error:
         raise PermissionError(
@@ -86,7 +89,7 @@ def check_writable(folder: Path) -> None:
 
 
 def check_file(path: Path) -> None:
-    """Raise if the file `path` cannot be written, before hours of work; nothing is created."""
+    """Raise if the file `path` cannot be written; nothing is created."""
     if path.is_dir():
         raise IsADirectoryError(
             f"cannot write {path}: it is a folder: name a file, such as {path}/NAME"
@@ -111,7 +114,7 @@ def write_json(path: Path, content: Any) -> None:
 
 def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content with its digest as the entry `sha256`, which `read_json` checks."""
-    # The digest is of the content as JSON returns it: keys are strings, and tuples are lists.
+    # Hash the content as it is after a round trip through JSON: keys are strings, tuples are lists.
     json_content = json.loads(json.dumps(content))
     return {
         _SEAL: hashlib.sha256(json.dumps(json_content, sort_keys=True).encode()).hexdigest(),
@@ -125,14 +128,14 @@ def check_digest(path: Path, content: bytes, expected: Any, description: str) ->
     Args:
         path: the file.
         content: its content.
-        expected: digest from the description.
-        description: name of the file with the digest.
+        expected: the recorded digest.
+        description: name of the file that records the digest.
     """
     if expected is not None and hashlib.sha256(content).hexdigest() != expected:
         raise ValueError(
             f"{path} is truncated or damaged, or it and {description} do not belong together: its"
-            " sha256 differs from the recorded one. Copy both files again from their source; a"
-            " killed training repairs its files when it is resumed"
+            " sha256 differs from the recorded one. Copy both files again from their source; if the"
+            " training was killed, resume it, which repairs the files"
         )
 
 
@@ -167,8 +170,8 @@ def read_json(path: Path, kind: str) -> Any:
     json_content = {name: value for name, value in content.items() if name != _SEAL}
     if content[_SEAL] != with_digest(json_content)[_SEAL]:
         raise ValueError(
-            f"{path} is not the {kind} that was written: its content does not have the {_SEAL} that"
-            " it names. It was damaged or edited: copy it again from its source, or delete its"
-            f" entry {_SEAL} if you meant to edit it"
+            f"{path} is not the {kind} that was written: its content does not match its entry"
+            f" {_SEAL}. It was damaged or edited: copy it again from its source, or delete the"
+            f" entry {_SEAL} if you edited it on purpose"
         )
     return json_content

@@ -1,6 +1,6 @@
 """Policies as files that are safe to load: safetensors for the weights, JSON for everything else.
 
-`load_policy` never unpickles, so a policy from an unknown source can only choose bad actions.
+`load_policy` never unpickles, so a malicious policy can only choose bad actions.
 `load_sb3_zip` unpickles, and requires `trust`.
 """
 
@@ -30,7 +30,7 @@ class Policy(Protocol):
     def predict(
         self, observation: np.ndarray, *, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
-        """Return actions (N, ...) for observations (N, k), and a state that is not used."""
+        """Return actions (N, ...) for observations (N, k), and a state, which callers ignore."""
 
 
 def _describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
@@ -83,7 +83,7 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
 
     Args:
         folder: a run folder, or any folder with `policy.safetensors` and `policy.json`.
-        trust: whether to import the module of a custom agent, which executes it.
+        trust: import, and thereby execute, the module of a custom agent.
 
     Returns:
         The policy (`predict(observations, deterministic=...)`).
@@ -99,9 +99,9 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
     description = read_json(folder / DESCRIPTION, "policy description")
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         raise ValueError(
-            f"{folder / DESCRIPTION}: not a policy of this program: its format must be {FORMAT!r}"
+            f"{folder / DESCRIPTION}: not a policy of codrl_mj: its format must be {FORMAT!r}"
         )
-    # A damaged key, such as that of the digest, would otherwise pass as a missing digest.
+    # Without this check, a damaged name of the digest would pass as a missing digest.
     if unknown_entries := description.keys() - _ENTRIES:
         raise ValueError(
             f"{folder / DESCRIPTION} has unknown entries:"
@@ -179,8 +179,7 @@ def load_sb3_zip(path: Path, agent: str, trust: bool, normalize: Path | str | No
     if not trust:
         raise ValueError(
             f"{path} is a Stable-Baselines3 model: it holds pickled Python objects, and loading it"
-            " executes whatever its author put there. Pass --trust if you are the author,"
-            " or if you would run the author's programs"
+            " executes their code. Pass --trust if you are the author, or if you trust the author"
         )
     import stable_baselines3
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -188,7 +187,8 @@ def load_sb3_zip(path: Path, agent: str, trust: bool, normalize: Path | str | No
     kind: Any = getattr(stable_baselines3, agent.upper(), None)
     if not isinstance(kind, type) or not issubclass(kind, BaseAlgorithm):
         raise ValueError(
-            f"agent = {agent!r}: Stable-Baselines3 has no such agent; name the one that made {path}"
+            f"agent = {agent!r}: Stable-Baselines3 has no such agent; name the agent that saved"
+            f" {path}"
         )
     try:
         model = kind.load(path, device="cpu")  # type: ignore[attr-defined]
@@ -213,7 +213,7 @@ def _load_statistics(path: Path, space: spaces.Space[Any]) -> Any:
         statistics = pickle.loads(path.read_bytes())
     except FileNotFoundError:
         raise FileNotFoundError(
-            f"--normalize {path}: no such file; name what VecNormalize.save wrote, or none"
+            f"--normalize {path}: no such file; name the file that VecNormalize.save wrote, or none"
         ) from None
     # Unpickled objects can raise any exception.
     except Exception as error:
@@ -232,7 +232,7 @@ def _load_statistics(path: Path, space: spaces.Space[Any]) -> Any:
     )
     if np.shape(mean) != space.shape:
         raise ValueError(
-            f"--normalize {path}: is for {statistics.observation_space}, the policy observes"
+            f"--normalize {path}: is for {statistics.observation_space}, but the policy observes"
             f" {space}: name the file that was saved with the policy"
         )
     return statistics
@@ -259,26 +259,27 @@ def _check_normalization(path: Path, model: Any) -> None:
         isinstance(last_observations, np.ndarray)
         and ((last_observations < space.low - 1e-4) | (last_observations > space.high + 1e-4)).any()
     ):
-        reason = "its last observations lie outside of its observation space, as normalized ones do"
+        reason = "its last observations are outside its observation space, as normalized ones are"
     elif statistics_files:
         reason = f"{', '.join(map(str, sorted(statistics_files)[:3]))} may have its statistics"
-    remedy = "name what VecNormalize.save wrote with --normalize FILE.pkl, or say --normalize none"
+    remedy = "pass the file of VecNormalize.save as --normalize FILE.pkl, or --normalize none"
     if reason:
         raise ValueError(
-            f"{path} may be half of a policy that was trained behind VecNormalize: {reason}:"
+            f"{path} was probably trained with VecNormalize and needs its statistics: {reason}:"
             f" {remedy}"
         )
     if model.num_timesteps and not (is_on_policy and last_observations is not None):
         warnings.warn(
-            f"{path} does not say whether it was trained behind VecNormalize: if so, {remedy}",
+            f"{path} does not say whether it was trained with VecNormalize: {remedy}",
             stacklevel=3,
         )
 
 
 def check_spaces(policy: Any, env: EnvConfig, exact: bool = True) -> None:
-    """Raise if an environment has other spaces than those of a policy's training, if known.
+    """Raise if the spaces of an environment differ from those of a policy's training.
 
-    Without `exact`, a difference only in the bounds of the actions is a warning.
+    A space that the policy does not have is not compared. Without `exact`, a difference only in the
+    bounds of the actions causes a warning instead of an error.
     """
     if all(getattr(policy, name, None) is None for name in ("observation_space", "action_space")):
         return
@@ -289,16 +290,16 @@ def check_spaces(policy: Any, env: EnvConfig, exact: bool = True) -> None:
     for name, space in env_spaces.items():
         if (trained := getattr(policy, name, None)) is None or _is_same(trained, space):
             continue
-        text = f"{name}: the policy was trained with {trained}, {env.task} as it is set has {space}"
+        text = f"{name}: the policy was trained with {trained}, but {env.task} now has {space}"
         frames = np.prod(trained.shape or (1,)) / np.prod(space.shape or (1,))
         if name == "observation_space" and frames > 1 and frames % 1 == 0:
             text += (
-                f" ({frames:g} times as many: stacked frames, as of VecFrameStack, are not"
+                f" ({frames:g} times as many: stacked frames, as with VecFrameStack, are not"
                 " supported)"
             )
         text += (
-            ": set what it was trained with, by --env.action, --env.observe-actuator, --actuator,"
-            " --env.options"
+            ": repeat the settings of its training (--env.action, --env.observe-actuator,"
+            " --actuator, --env.options)"
         )
         if exact or name != "action_space" or not _is_same(trained, space, bounds=False):
             raise ValueError(text)

@@ -83,9 +83,9 @@ class RunSummary:
 
 
 def find_runs(root: Path) -> list[RunSummary]:
-    """Return every run folder at or below a folder by name; hidden folders are skipped."""
+    """Return the runs in a folder and its subfolders by name; hidden folders are skipped."""
     if not root.is_dir():
-        raise FileNotFoundError(f"no folder {root} to look for runs in")
+        raise FileNotFoundError(f"no folder {root} to search for runs")
     runs = []
     for folder, subfolders, files in os.walk(root):
         if CONFIG in files:
@@ -210,7 +210,7 @@ def _mapping(path: Path, kind: str, problems: list[str]) -> Mapping[str, Any] | 
         problems.append(str(error))
         return None
     if not isinstance(content, Mapping):
-        problems.append(f"{path} is not a {kind}: it is no JSON object")
+        problems.append(f"{path} is not a {kind}: it is not a JSON object")
         return None
     return content
 
@@ -235,7 +235,7 @@ def read_reports(path: Path, problems: list[str]) -> list[Mapping[str, str]]:
 
 
 def _number(value: Any) -> float | None:
-    """Return a finite number, or None."""
+    """Convert a value to a finite number; None if that is impossible."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -244,7 +244,7 @@ def _number(value: Any) -> float | None:
 
 
 def _whole(value: Any) -> int | None:
-    """Return an integer, or None."""
+    """Convert a value to an integer; None if that is impossible."""
     number = _number(value)
     return None if number is None else int(number)
 
@@ -261,7 +261,7 @@ def _modified(folder: Path) -> float | None:
 
 
 def _first(name: str, *sources: Mapping[str, Any] | None) -> float | None:
-    """Return the first finite number of a name among sources; None if there is none."""
+    """Return the first finite number among the values of a name in some mappings; None if none."""
     numbers = (_number((source or {}).get(name)) for source in sources)
     return next((number for number in numbers if number is not None), None)
 
@@ -336,7 +336,7 @@ class Comparison:
 def compare(runs: Sequence[RunSummary]) -> Comparison:
     """Return the differing settings and the results of two or more runs."""
     if len(runs) < 2:
-        raise ValueError(f"runs: {len(runs)}: there must be two or more to compare")
+        raise ValueError(f"runs: got {len(runs)}: a comparison needs two or more")
     named = [{**run.configuration, "env.actuator": run.actuator} for run in runs]
     # The ideal actuator has no fields to compare, so only the actuators' names are.
     if any(run.actuator == "ideal" for run in runs):

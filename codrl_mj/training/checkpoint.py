@@ -192,8 +192,8 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
         os.fsync(file.fileno())
     existing = find_checkpoints(folder)
     older = [name for name, parts in existing.items() if parts["step"] < step]
-    # Other files are of the same step, or of a later one that was damaged, so that the run went
-    # back.
+    # All other files are obsolete: older ones, ones of the same step, and damaged ones of a later
+    # step, before which the run was resumed.
     for obsolete in existing.keys() - {path, *older[1 - NUM_CHECKPOINTS :]}:
         obsolete.unlink(missing_ok=True)
     return path
@@ -225,7 +225,7 @@ def _read(path: Path, digest: str, run: str) -> State:
     """
     content = path.read_bytes()
     if _digest(content) != digest:
-        raise ValueError("it is damaged: its content does not have the digest in its name")
+        raise ValueError("it is damaged: its content does not match the digest in its name")
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata()

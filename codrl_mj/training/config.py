@@ -65,7 +65,7 @@ class TrainConfig(Checked):
             )
         if self.total_steps is None and self.env.time_limit is None:
             raise ValueError(
-                f"TrainConfig.total_steps = None: {self.task} has no time limit: give"
+                f"TrainConfig.total_steps = None: {self.task} has no time limit: set"
                 " max_episode_steps"
             )
 
@@ -196,8 +196,8 @@ def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConf
         path: the file; the `config.json` of a run folder is possible, too.
         trust: import, and thereby execute, the module of an actuator that the file names as
             `module:NAME`.
-        **overriding: values of other top-level keys. None has no effect, nor has the name of the
-            agent whose settings are in the file.
+        **overriding: values that replace top-level keys of the file. None has no effect. An agent
+            with the name that is in the file keeps the settings in the file.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -1,4 +1,4 @@
-"""Run folders: the files in them, the software behind them, and their lock during a training."""
+"""Run folders: their files, the record of the software versions, and their lock in a training."""
 
 import contextlib
 import functools
@@ -117,7 +117,7 @@ def prepare_run(
 def is_unused(run: Path) -> bool:
     """Return True if no training has started in a folder.
 
-    It is then empty, or has only leftovers of a process that was killed before it started.
+    Such a folder is empty, or has only temporary files of a process that was killed early.
     """
     return {path.name for path in run.iterdir()} <= {LOCK, *(path.name for path in _leftovers(run))}
 
@@ -127,7 +127,7 @@ def needs_trust(run: Path) -> bool:
     try:
         load_config(run)
     except (ValueError, OSError):
-        # A damaged run is included; loading it reports the damage.
+        # A damaged run counts, too: the verb that loads it reports the damage.
         return True
     return False
 
@@ -141,13 +141,13 @@ def describe_remains(run: Path) -> str:
     """Return a sentence on how to continue a training that was interrupted."""
     if existing := find_checkpoints(run / CHECKPOINTS):
         step = max(int(parts["step"]) for parts in existing.values())
-        return f"Its last checkpoint is that of step {step:,}: continue with {resume_command(run)}"
+        return f"The last checkpoint is from step {step:,}: continue with {resume_command(run)}"
     if (run / BEST / EVALUATION).exists():
         return (
-            f"It has no checkpoint to continue from, only its best policy so far, in {run / BEST}:"
-            " start it again"
+            f"It has no checkpoint to continue from. The best policy so far is in {run / BEST}."
+            " Start it again"
         )
-    return "It had no checkpoint yet, and its files were deleted: start it again"
+    return "It had no checkpoint yet, so its files were deleted: start it again"
 
 
 def _leftovers(folder: Path) -> list[Path]:
@@ -171,7 +171,7 @@ def _delete_leftovers(run: Path) -> None:
 def check_resumable(
     run: Path, config: TrainConfig, software: Mapping[str, Any], accept_changes: bool
 ) -> None:
-    """Raise an error unless a training can be continued to the same result as without interruption.
+    """Raise if continuing a training might not give the result of an uninterrupted training.
 
     Args:
         run: the run folder.
@@ -190,8 +190,9 @@ def check_resumable(
             for name, (started, requested) in changes.items()
         )
         raise ValueError(
-            f"{run} was started with another configuration (its value, and the requested one):"
-            f" {description}. A run keeps its settings: choose another run folder for other settings"
+            f"{run} was started with another configuration (stored and requested values):"
+            f" {description}. A run keeps its settings: choose another run folder for other"
+            " settings"
         )
     record = read_json(run / CONFIG, "run configuration")
     versions = record.get("versions")
@@ -200,8 +201,8 @@ def check_resumable(
             f"{run / CONFIG}: not a run configuration: versions = {versions!r}: must be a mapping"
         )
     changed = [
-        f"{name} was {was}, is {is_now}"
-        for name, (was, is_now) in differences(versions, software["versions"]).items()
+        f"{name} was {stored}, is {current}"
+        for name, (stored, current) in differences(versions, software["versions"]).items()
     ]
     if record.get("code") != software["code"]:
         changed.append(
@@ -209,7 +210,7 @@ def check_resumable(
         )
     if changed and not accept_changes:
         raise ValueError(
-            f"{run} was started with other software: {'; '.join(changed)}. Its result might differ"
+            f"{run} was started with other software: {'; '.join(changed)}. The result might differ"
             " from that of an uninterrupted run: install that software again, or accept the change"
             " with --accept-changes"
         )
@@ -258,14 +259,14 @@ def locked_for_training(run: Path, exists: bool) -> Iterator[None]:
     with locked(run):
         if finished(run) or not ((run / CONFIG).exists() if exists else is_unused(run)):
             raise RunInUseError(
-                f"{run}: another process trained in it in the meantime; start again"
+                f"{run}: another process has trained in it in the meantime; start again"
             )
         _delete_leftovers(run)
         try:
             yield
         except BaseException as error:
-            # A folder that existed, or that a stopped training is to be continued in, is kept. All
-            # files of any other are this training's.
+            # A folder is kept if it existed before, or if a stopped training can continue in it.
+            # Otherwise all its files come from this training, and are deleted.
             if exists or isinstance(error, TrainingStoppedError):
                 raise
             _delete_leftovers(run)
@@ -274,7 +275,7 @@ def locked_for_training(run: Path, exists: bool) -> Iterator[None]:
                     (run / name).unlink(missing_ok=True)
                 shutil.rmtree(run / TENSORBOARD, ignore_errors=True)
                 for path in (run / CHECKPOINTS, run / BEST, *new_folders):
-                    # A folder into which others have written meanwhile is not empty, and is kept.
+                    # `rmdir` fails for a folder into which another process has written; it is kept.
                     with contextlib.suppress(OSError):
                         path.rmdir()
             raise

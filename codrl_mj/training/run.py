@@ -38,14 +38,14 @@ def train(
     stops at once.
 
     Args:
-        config: what to train.
+        config: configuration of the training.
         out: the run folder.
         on_progress: function that is called at the ends of rollouts.
         resume: continue the run in `out` from its last intact checkpoint, to the same result as
             that of an uninterrupted run. Start it if there is none, and return if it is finished.
         accept_changes: continue even if code or package versions differ from those at its start.
         tensorboard: write events for TensorBoard, if it is installed.
-        wandb: name of a Weights & Biases project to report to as well.
+        wandb: name of a Weights & Biases project that also gets the reports.
 
     Returns:
         `out`.
@@ -91,15 +91,15 @@ def train(
                     write_json(out / CONFIG, with_digest(record))
                 steps = config.total_steps
                 if steps is None:
-                    # Episodes are counted; this is the number of steps of the longest possible
-                    # ones.
+                    # The watcher ends learning after `total_episodes`. The longest possible
+                    # episodes give an upper bound of the steps.
                     steps = (
                         (config.total_episodes or 0)
                         * (config.env.time_limit or 0)
                         * config.num_envs
                     )
-                # The watcher sets its logger when learning begins. The default logger would create
-                # a folder among the system's temporary files before.
+                # The watcher sets its logger when learning begins. Without this line, the default
+                # logger would create a temporary folder before that.
                 model.set_logger(Logger(None, []))
                 with contextlib.suppress(LearningEnded):
                     model.learn(steps, callback=watcher, log_interval=None)

@@ -1,4 +1,4 @@
-"""Callback of trainings that records, reports, evaluates, writes checkpoints and stops."""
+"""Training callback that records, reports, evaluates, writes checkpoints and stops."""
 
 import contextlib
 import json
@@ -60,7 +60,7 @@ class Watcher(BaseCallback):
         )
         self._tensorboard = tensorboard
         self._marks = {"report": 0, "evaluation": 0, "checkpoint": 0}
-        # The sum of the squares of the torque error since the last report, and their number.
+        # Sum of the squared torque errors since the last report, and the number of samples.
         self._squares, self._samples = 0.0, 0
         self._best = {"return": -math.inf, "steps": 0}
         self._seconds_before, self._steps_before, self._start = 0.0, 0, time.perf_counter()
@@ -75,7 +75,7 @@ class Watcher(BaseCallback):
         """Restore the last checkpoint after the model has initialized itself."""
         self._arms = self.training_env.arm_radii  # type: ignore[attr-defined]
         if any(path.endswith("arm_radius") for path in self._config.env.distributions):
-            # With a random arm there is no arm that holds for all episodes.
+            # With a randomized arm radius, no single value is valid for all episodes.
             self._arms = np.full_like(self._arms, math.nan)
         state = self._resumed = load_checkpoint(self._out / CHECKPOINTS, self._identity)
         rows: dict[str, np.ndarray | None] = {"episodes": None, "reports": None}
@@ -148,7 +148,7 @@ class Watcher(BaseCallback):
 
     @contextlib.contextmanager
     def explaining_errors(self) -> Iterator[None]:
-        """Explain errors in a block: a full disk, a second Ctrl-C, weights that are not finite."""
+        """Add the state of the run to errors: a full disk, a second Ctrl-C, weights not finite."""
         try:
             yield
         except OSError as error:
@@ -165,7 +165,7 @@ class Watcher(BaseCallback):
             raise
 
     def _check_weights(self) -> None:
-        """Raise an error if a weight is not finite, before it is saved; name the likely cause."""
+        """Raise an error that names the likely cause if a weight is not finite."""
         # The model is set when learning begins.
         model = getattr(self, "model", None)
         if model is None or all(

@@ -159,7 +159,7 @@ class Ledger:
     """Kinetic and potential energy, minus that at the start."""
     lost: np.ndarray
     """Integral of the loss in dampers and medium, by the trapezoidal rule; zeros without any."""
-    identity: float
+    identity_error: float
     """Largest error of the winding's identity in a step, over the largest energy supplied.
 
     The error is |(u - kE*omega - R*i)*(i + i')*dt/2 - L*(i'^2 - i^2)/2|.
@@ -242,7 +242,7 @@ def record_energies(
         shaft=np.cumsum(force * np.diff(state[:, positions], axis=0), axis=0).sum(axis=1)[recorded],
         mechanical=np.array([meter(row) for row in state[1:][recorded]]) - meter(state[0]),
         lost=_integral(lost, timestep)[recorded, 0],
-        identity=float(
+        identity_error=float(
             # The lower bound avoids 0/0 with ideal actuators.
             np.abs(winding - np.diff(magnetic, axis=0)).max() / max(np.abs(supplied).max(), 1e-300)
         ),
@@ -285,7 +285,7 @@ def step_by_step(task: Task, quick: bool) -> Iterator[Case]:
             except SimulationDivergedError as error:
                 yield Case(math.inf, f"{where}: {error}", samples)
             else:
-                yield Case(ledger.identity, where, samples)
+                yield Case(ledger.identity_error, where, samples)
 
 
 def _ledgers(

@@ -42,9 +42,9 @@ from codrl_mj.validation.motor_catalogue import drive_checks
 from codrl_mj.validation.motor_loops import order_to_closed_form, sampled_checks
 from codrl_mj.validation.own_model import compiled_checks
 from codrl_mj.validation.rotors import (
-    FREE,
-    LOCKED,
-    SWINGING,
+    ECCENTRIC_ROTOR,
+    FREE_ROTOR,
+    LOCKED_ROTOR,
     Loop,
     Record,
     Rotor,
@@ -71,10 +71,10 @@ MOTORS: dict[str, Motor] = {
 """Motors that are compared: the paper's, and one whose parameters all differ from each other."""
 
 _NATIVE_CASES: tuple[tuple[Rotor, str], ...] = (
-    (LOCKED, "Euler"),
-    (LOCKED, "implicitfast"),
-    (FREE, "Euler"),
-    (SWINGING, "Euler"),
+    (LOCKED_ROTOR, "Euler"),
+    (LOCKED_ROTOR, "implicitfast"),
+    (FREE_ROTOR, "Euler"),
+    (ECCENTRIC_ROTOR, "Euler"),
 )
 
 
@@ -149,7 +149,7 @@ def equal_to_native(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
         yield Case(
             difference,
             description,
-            plots=(plot,) if (name, rotor, share) == ("paper", SWINGING, 0.1) else (),
+            plots=(plot,) if (name, rotor, share) == ("paper", ECCENTRIC_ROTOR, 0.1) else (),
         )
 
 
@@ -163,7 +163,9 @@ def equal_to_native(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
 def order_in_substeps(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     """Check that the difference is of first order in the substeps, at the true inductance."""
     counts, series = 2 ** np.arange(4, 8 if quick else 11), []
-    for (name, motor), rotor in itertools.product(motors.items(), (LOCKED, FREE, SWINGING)):
+    for (name, motor), rotor in itertools.product(
+        motors.items(), (LOCKED_ROTOR, FREE_ROTOR, ECCENTRIC_ROTOR)
+    ):
         timestep = 0.2 * motor.electrical_time_constant
         actuators = [voltage_actuator(motor, int(count)) for count in counts]
         errors = [
@@ -186,7 +188,7 @@ def order_in_substeps(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case
 def order_under_implicitfast(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     """Check that the difference under `implicitfast` is of second order in the step."""
     divisors, series = 2 ** np.arange(5, 9 if quick else 11), []
-    for (name, motor), rotor in itertools.product(motors.items(), (FREE, SWINGING)):
+    for (name, motor), rotor in itertools.product(motors.items(), (FREE_ROTOR, ECCENTRIC_ROTOR)):
         steps, errors = motor.electrical_time_constant / divisors, []
         for divisor, timestep in zip(divisors, steps, strict=True):
             comparison = _compare_with_native(
@@ -219,7 +221,9 @@ def rk4_check(quick: bool) -> Iterator[Case]:
         currents = (1.0 / motor.resistance) * (1.0 - np.exp(-share * np.arange(1, len(volts) + 1)))
         ours[index], native[index] = (
             np.abs(
-                simulate(build_rotors(LOCKED, [simulated], timestep, "RK4"), volts).current[:, 0]
+                simulate(build_rotors(LOCKED_ROTOR, [simulated], timestep, "RK4"), volts).current[
+                    :, 0
+                ]
                 / currents
                 - 1.0
             ).max()
@@ -301,12 +305,13 @@ def gem_check(motor: Motor, quick: bool) -> Iterator[Case]:
     The integrator is Euler, on a free rotor.
     """
     voltages = np.random.default_rng(1).uniform(-SUPPLY, SUPPLY, 20 if quick else 40)
-    speed, current = gem_run(motor, FREE.inertia, voltages)
+    speed, current = gem_run(motor, FREE_ROTOR.inertia, voltages)
     counts = 2 ** np.arange(4, 8 if quick else 11)
     errors = np.empty((2, len(counts)))
     for index, count in enumerate(counts.tolist()):
         record = simulate(
-            build_rotors(FREE, [voltage_actuator(motor)], PERIOD / count), voltages.repeat(count)
+            build_rotors(FREE_ROTOR, [voltage_actuator(motor)], PERIOD / count),
+            voltages.repeat(count),
         )
         errors[:, index] = [
             np.abs(ours[count - 1 :: count, 0] - oracle).max()
@@ -348,7 +353,7 @@ def torque_speed_line(motors: Mapping[str, Motor]) -> Iterator[Case]:
         no_load_speed = (
             VOLTAGE / motor.back_emf_constant * motor.arm_radius if has_back_emf else 0.0
         )
-        model = build_rotors(LOCKED, [voltage_actuator(motor)] * len(shares), timestep)
+        model = build_rotors(LOCKED_ROTOR, [voltage_actuator(motor)] * len(shares), timestep)
         speeds = np.tile(shares * no_load_speed, (200, 1))
         run = simulate(model, np.full(len(speeds), VOLTAGE), speeds)
         line = (
@@ -385,11 +390,11 @@ def no_load(motors: Mapping[str, Motor]) -> Iterator[Case]:
         if motor.back_emf_constant == 0:
             continue
         product = motor.torque_constant * motor.back_emf_constant / motor.arm_radius**2
-        mechanical = FREE.inertia * motor.resistance / product
+        mechanical = FREE_ROTOR.inertia * motor.resistance / product
         timestep = 0.05 * min(motor.electrical_time_constant, mechanical)
         steps = int(40 * (2 * motor.electrical_time_constant + mechanical) / timestep)
         run = simulate(
-            build_rotors(FREE, [voltage_actuator(motor)], timestep),
+            build_rotors(FREE_ROTOR, [voltage_actuator(motor)], timestep),
             np.full(min(steps, 40_000), VOLTAGE),
         )
         no_load_speed = VOLTAGE / motor.back_emf_constant * motor.arm_radius
@@ -425,7 +430,9 @@ def voltage_limit(loops: Mapping[str, Loop]) -> Iterator[Case]:
         for sign in (1.0, -1.0):
             controls = np.full(steps, 1000.0 * sign * stall)
             torque = simulate(
-                build_rotors(LOCKED, [loop.actuator], loop.timestep), controls, np.zeros(steps)
+                build_rotors(LOCKED_ROTOR, [loop.actuator], loop.timestep),
+                controls,
+                np.zeros(steps),
             ).torque[-1, 0]
             error = abs(float(torque) * motor.arm_radius / (sign * stall) - 1.0)
             yield Case(error, f"{name}, {torque:.6g} N m at {sign * limit:g} V")

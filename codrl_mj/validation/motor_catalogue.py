@@ -25,7 +25,7 @@ from codrl_mj.catalogue import motor_names
 from codrl_mj.physics import MujocoPhysics, SimulationConfig, SimulationDivergedError
 from codrl_mj.tasks import Task
 from codrl_mj.validation.compare import differences, gymnasium_equations
-from codrl_mj.validation.rotors import LOCKED, build_rotors, simulate
+from codrl_mj.validation.rotors import LOCKED_ROTOR, build_rotors, simulate
 from codrl_mj.validation.table import Case, Check, check
 
 TASK_MOTORS = {
@@ -267,7 +267,8 @@ def drive_checks(quick: bool) -> Iterator[tuple[Case, ...]]:
     torques = generator.uniform(-1.5, 1.5, (steps, len(stalls))) * stalls
     speeds = generator.uniform(-1.0, 1.0, torques.shape) * no_load_speeds
     ours, stepped = (
-        simulate(build_rotors(LOCKED, list(drives), timestep), torques, speeds * arms).torque * arms
+        simulate(build_rotors(LOCKED_ROTOR, list(drives), timestep), torques, speeds * arms).torque
+        * arms
         for drives in (closed_form.values(), stepping)
     )
     exact = np.array(

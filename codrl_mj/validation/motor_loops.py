@@ -15,7 +15,7 @@ from scipy import linalg, signal
 
 from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.validation.rotors import (
-    LOCKED,
+    LOCKED_ROTOR,
     Loop,
     build_rotors,
     linear_actuator,
@@ -287,7 +287,7 @@ def _measured_response(
     """
     settle = math.ceil(math.log(1e-10) / math.log(min(max(slowest, 0.5), 0.9999)))
     phases = 2 * np.pi * frequencies * step * np.arange(settle + 1200)[:, np.newaxis]
-    model = build_rotors(LOCKED, [actuator] * len(frequencies), step)
+    model = build_rotors(LOCKED_ROTOR, [actuator] * len(frequencies), step)
     torque = simulate(
         model, np.cos(phases) * actuator.motor.arm_radius, np.zeros(len(phases))
     ).torque

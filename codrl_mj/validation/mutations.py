@@ -116,7 +116,7 @@ def _wrong_callbacks(edits: tuple[Edit, ...]) -> Callable[[], Any]:
     """Return the function that compiles the callbacks of the edited source."""
     wrong = compile_edited(control, edits)
     wrong.HIDDEN = _HIDDEN.ctypes.data  # type: ignore[attr-defined]
-    return wrong.compiled_motors
+    return wrong.motor_callbacks
 
 
 @contextlib.contextmanager

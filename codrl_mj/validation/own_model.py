@@ -41,7 +41,7 @@ from codrl_mj.physics.variation import without_motors
 from codrl_mj.tasks import find_task, resolve_actuators
 from codrl_mj.validation.compare import FALLBACK_ACTUATOR, paper_actuators
 from codrl_mj.validation.execution import UNIT, commands, differs
-from codrl_mj.validation.rotors import EVERY_FEATURE, SWINGING, Loop, build_rotors
+from codrl_mj.validation.rotors import ECCENTRIC_ROTOR, EVERY_FEATURE, Loop, build_rotors
 from codrl_mj.validation.table import Case, Check, Skipped, check
 
 STEP_TOLERANCE = 1e-11
@@ -313,7 +313,7 @@ def compiled_checks(quick: bool) -> Iterator[Check]:
     actuators = list({type(actuator): actuator for actuator in (*commanded, *registered)}.values())
     for actuator in actuators:
         load_family(type(actuator))
-    model = build_rotors(SWINGING, actuators, 0.01)
+    model = build_rotors(ECCENTRIC_ROTOR, actuators, 0.01)
     values = compare_with_python(
         model, dict(enumerate(actuators)), commands(model, 200 if quick else 2000, seed=7)
     )

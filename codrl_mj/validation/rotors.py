@@ -26,11 +26,11 @@ class Rotor:
     """True if a mass of 0.5 kg hangs 0.2 m off the axis, under gravity."""
 
 
-LOCKED = Rotor("locked rotor", 1e15)
+LOCKED_ROTOR = Rotor("locked rotor", 1e15)
 """Rotor of constant speed: a torque of 1 N*m over 100 s changes it by 1e-13 rad/s."""
-FREE = Rotor("free spinning", 0.2)
+FREE_ROTOR = Rotor("free spinning", 0.2)
 """Rotor without a load."""
-SWINGING = Rotor("swinging load", 0.2, eccentric=True)
+ECCENTRIC_ROTOR = Rotor("swinging load", 0.2, eccentric=True)
 """Rotor with an eccentric mass, under gravity."""
 
 
@@ -203,5 +203,7 @@ def simulate_torques(
 ) -> Record:
     """Simulate one motor in MuJoCo under desired joint torques at joint speeds."""
     return simulate(
-        build_rotors(LOCKED, [actuator], timestep), torques * actuator.motor.arm_radius, speeds
+        build_rotors(LOCKED_ROTOR, [actuator], timestep),
+        torques * actuator.motor.arm_radius,
+        speeds,
     )

@@ -320,7 +320,7 @@ def test_the_current_limit_holds():
         (lambda: Drive(supply=24.0), r"Drive\.supply = 24\.0: must be a Supply"),
         (
             lambda: Drive().check(0.00123),
-            r"holds 24\.6 samples, must be a whole number of them; the nearest rate is 20325",
+            r"has 24\.6 samples, must be a whole number; the nearest valid rate is 20325",
         ),
         (
             lambda: Drive(controller=SampledLoop(kp=500.0)).check(0.002),
@@ -443,13 +443,13 @@ def test_an_arm_of_two_light_links_is_bounded_at_20_ms_and_accurate_at_2_ms(name
 
 def test_raises_if_a_held_speed_is_unstable_and_warns_if_it_is_inaccurate():
     with pytest.raises(
-        ValueError, match=r"^a0: .*takes 2\.\d+ of the rotor's speed .* leave motor.load_inertia 0"
+        ValueError, match=r"^a0: .*by 2\.\d+ times its value.* leave motor.load_inertia 0"
     ):
         chain("dcx22l", 0.02, [math.inf])
-    with pytest.warns(UserWarning, match=r"above 0\.5 it is inaccurate"):
+    with pytest.warns(UserWarning, match=r"above 0\.5 the speed is inaccurate"):
         chain("1331t", 0.02, [math.inf])
     with pytest.warns(
-        UserWarning, match=r"is 22\.4 times the time in which .* steps late: shorten the step"
+        UserWarning, match=r"is 22\.4 times the time in which .* as many steps: shorten the step"
     ):
         chain("dcx22l", 0.2, [0.0])
     light = dataclasses.replace(
@@ -469,7 +469,7 @@ def test_the_analytic_physics_checks_the_speed_held_over_a_step():
     # The rod's inertia is 1/3 kg*m^2.
     assert 0.05 * 120**2 * 0.0203**2 / (0.315 / 3) > 2
     codrl_mj.make("pendulum", drive, inner_steps=1).close()
-    with pytest.raises(ValueError, match=r"during which it is held, must be < 2; shorten the step"):
+    with pytest.raises(ValueError, match=r"speed is held for .*, must be < 2; shorten the step"):
         codrl_mj.make("pendulum", drive, inner_steps=1, physics="analytic")
 
 
@@ -479,9 +479,7 @@ def test_drives_on_the_same_joint_are_checked_together():
     spec.add_actuator(name="b", target="joint0", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
     motor = stiff("dcx22l", 0.0)
     codrl_mj.add_motors(spec, {"a0": motor})
-    with pytest.raises(
-        ValueError, match=r"in 0\.02 s during which it is held, must be < 2; shorten the step"
-    ):
+    with pytest.raises(ValueError, match=r"held for 0\.02 s, .*, must be < 2; shorten the step"):
         codrl_mj.add_motors(spec, {"a0": motor, "b": motor})
 
 

@@ -190,7 +190,7 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
     [
         (
             "papr",
-            r"^unknown actuator 'papr': did you mean 'paper'\? It can be module:NAME of your own$",
+            r"^unknown actuator 'papr': did you mean 'paper'\? It can also be your own as module:NAME$",
         ),
         ("weakest", r"'weakest': did you mean 'weaker'\?"),
         ("open-loop", r"'open-loop': did you mean 'open_loop'\?"),
@@ -252,8 +252,8 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
             "'nowhere_at_all:Mine': No module named 'nowhere_at_all'; must be",
         ),
         ({"family": f"{__name__}:Yours"}, "has no attribute 'Yours'; must be module:NAME"),
-        ({"family": f"{__name__}:Motor"}, "is no subclass of codrl_mj's ActuatorModel"),
-        ({"family": f"{__name__}:MINE"}, "is no subclass of codrl_mj's ActuatorModel"),
+        ({"family": f"{__name__}:Motor"}, "is not a subclass of codrl_mj's ActuatorModel"),
+        ({"family": f"{__name__}:MINE"}, "is not a subclass of codrl_mj's ActuatorModel"),
         (
             {"family": "slipped.missing:Mine"},
             r"missing failed: ModuleNotFoundError: .*'nowhere_at_all' \(.*missing\.py",
@@ -279,7 +279,7 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
         *((name, rf"^{name}: ") for name in WRONG_FILES),
         (
             {"name": "ideal", "motor": {"resistance": 1.0}},
-            "the ideal actuator has no motor and no controller whose",
+            "the ideal actuator has no motor and no controller, and so",
         ),
         (
             {"name": "paper", "motor": {"resistence": 1.0}},
@@ -296,7 +296,8 @@ def test_raises_with_the_reason_if_a_setting_is_no_actuator(files, setting, mess
 @pytest.mark.parametrize("name", ["paper", "weak", "open_loop", "over.yaml"])
 def test_raises_if_a_task_has_no_paper_actuator_to_vary(files, name):
     with pytest.raises(
-        ValueError, match=r"actuator = '\w+': .* but bare has none; known names: current_loop"
+        ValueError,
+        match=r"actuator = '\w+': .* but bare has no such actuator; known names: current_loop",
     ):
         resolve_actuators(name, BARE)
     assert resolve_actuators("ideal", BARE) == (IDEAL,)

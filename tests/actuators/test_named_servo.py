@@ -153,7 +153,7 @@ def test_an_agent_commands_positions_or_speeds_of_a_named_motor(controls):
             "unknown actuator field loop of a drive: add family = 'servo'",
         ),
         ({"family": "servo", "motor": MOTOR}, f"write name = '{MOTOR}' beside the family"),
-        ({"name": "lag", "family": "servo"}, "cannot be set over an actuator of the family 'lag'"),
+        ({"name": "lag", "family": "servo"}, "cannot replace the family 'lag'"),
         ({"name": MOTOR, "family": "servoo"}, "unknown family 'servoo': did you mean 'servo'"),
         ({"name": "ideal", "family": "servo"}, "the ideal actuator has no motor"),
         (

@@ -10,7 +10,7 @@ import pytest
 
 import codrl_mj
 from codrl_mj import plugin
-from codrl_mj.actuators import Nothing
+from codrl_mj.actuators import Empty
 from codrl_mj.engine.families import load_family
 from tests.add_motors.models import Signals, Worn, arm
 
@@ -91,4 +91,4 @@ def test_a_redefined_family_replaces_the_previous_one_if_models_stay_valid():
         ValueError,
         match=r"Redefined has .* states, signals and parameters, and .* when it was loaded before",
     ):
-        load_family(family(2.0, Signals=Nothing))
+        load_family(family(2.0, Signals=Empty))

@@ -150,7 +150,7 @@ UNSTABLE = "noise_theta = 4.0: noise_theta * noise_dt must be < 2, and noise_dt 
         ),
         (lambda: agent_from_mapping({"gamma": 0.9}), "unknown agent 'None'"),
         (lambda: find_agent("reinforce"), "unknown agent 'reinforce': Known: ppo, ddpg, dqn"),
-        (lambda: find_agent(f"{__name__}:re"), "is no subclass of codrl_mj's AgentConfig"),
+        (lambda: find_agent(f"{__name__}:re"), "is not a subclass of codrl_mj's AgentConfig"),
     ],
 )
 def test_contradictory_settings_raise(make, message):

@@ -385,7 +385,7 @@ REFUSED = {
         {"no_load_speed": "9000 eRPM"},
         "no_load_speed",
         "9000 eRPM",
-        "divide by the pole pairs",
+        "number of pole pairs",
     ),
     "pole pairs": ({"pole_pairs": 14}, "pole_pairs", "omit it", "electrical rpm"),
     "a phase": (

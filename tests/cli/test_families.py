@@ -29,7 +29,7 @@ Path("executed").touch()
 class Slow(Lag):
     family = "slow"
 
-    time_constant: float = real(0.5, least=0.0, unit="s")
+    time_constant: float = real(0.5, minimum=0.0, unit="s")
     \"\"\"Half a second, if nothing else is said.\"\"\"
 """
 

@@ -14,12 +14,12 @@ REFUSED = [
         "",
         (
             "codrl-mj needs a verb: try codrl-mj motor list, or codrl-mj train cartpole first;"
-            " there are train,"
+            " verbs are train,"
         ),
     ),
-    ("", "board, validate; codrl-mj --help says more"),
+    ("", "board, validate; codrl-mj --help describes them"),
     ("trian cartpole", "unknown verb 'trian': did you mean 'train'? verbs are train, evaluate,"),
-    ("motor", "codrl-mj motor needs a verb: there are list, new, show,"),
+    ("motor", "codrl-mj motor needs a verb: verbs are list, new, show,"),
     ("motor lst", "unknown verb 'lst': did you mean 'list'? verbs are list, new, show,"),
     ("motor show", "codrl-mj motor show needs NAME;"),
     ("motor show maxon-ec45", "did you mean 'maxon-ec45-flat-339285' or 'maxon-ec45-flat-50w'?"),
@@ -28,9 +28,9 @@ REFUSED = [
     ("train", "codrl-mj train needs TASK; codrl-mj train --help says more"),
     (
         "train pendulm --agent sac",
-        "'pendulm': did you mean 'pendulum'? It can be module:NAME of your own",
+        "'pendulm': did you mean 'pendulum'? It can also be your own as module:NAME",
     ),
-    ("train pendulm", "for an environment of Gymnasium give its id, such as HalfCheetah-v5"),
+    ("train pendulm", "name an environment of Gymnasium by its id, such as HalfCheetah-v5"),
     ("render pendulm", "no run configuration at pendulm/config.json: did you mean 'pendulum'?"),
     (
         "train CartPole-v1",
@@ -101,7 +101,7 @@ REFUSED = [
             ("--env.levels", " -1 1"),
             ("--env.observe-actuator", ""),
         )
-        for text, end in (("", " = "), ("leave ", " out"))
+        for text, end in (("", " = "), ("omit ", ""))
     ),
 ]
 REFUSED_FLAGS = {

@@ -125,7 +125,7 @@ def test_the_short_help_has_every_flag_and_half_the_lines(capsys):
 
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if hasattr(find_verb(verb), "as_json")])
 def test_verbs_with_numbers_have_json(capsys, verb):
-    assert "--json Print JSON and nothing else" in help_text(capsys, *verb.split())
+    assert "--json Print only JSON" in help_text(capsys, *verb.split())
 
 
 # -- train, evaluate, render ----------------------------------------------------------------------
@@ -336,7 +336,7 @@ def test_warns_if_another_actuator_is_randomized_as_in_the_training(capsys):
     capsys.readouterr()
     run_ok("evaluate drawn --episodes 1 --actuator weak")
     assert (
-        "motor.inductance of weak are drawn from the ranges of the training"
+        "motor.inductance of weak are drawn from the training's distributions"
         in capsys.readouterr().err
     )
     run_ok("evaluate drawn --episodes 1 --actuator weak --env.randomize None")

@@ -199,10 +199,10 @@ def test_raises_for_a_policy_without_its_statistics(half, tmp_path, capsys):
         assert main([verb, str(half / "policy.zip"), *ZIP]) == 2
         error = capsys.readouterr().err
         assert (
-            "half of a policy that was trained behind VecNormalize: its last observations were"
+            "trained with VecNormalize and needs its statistics: its last observations were"
             " normalized" in error
         )
-        assert "--normalize FILE.pkl, or say --normalize none" in error
+        assert "--normalize FILE.pkl, or --normalize none" in error
     assert not list(tmp_path.iterdir())
     raw = load_sb3_zip(half / "policy.zip", "ppo", True, "none")
     expected = stable_baselines3.PPO.load(half / "policy.zip").predict(
@@ -220,7 +220,7 @@ def test_raises_for_unused_statistics_beside_a_zip(tmp_path, path):
     (tmp_path / path).parent.mkdir(exist_ok=True)
     (tmp_path / path).write_bytes(b"")
     with pytest.raises(
-        ValueError, match=rf"half of a policy.*{path} may have its statistics.*--normalize none"
+        ValueError, match=rf"needs its statistics.*{path} may have its statistics.*--normalize none"
     ):
         load_sb3_zip(tmp_path / "policy.zip", "ppo", True)
     assert load_sb3_zip(tmp_path / "policy.zip", "ppo", True, "none") is not None
@@ -229,7 +229,7 @@ def test_raises_for_unused_statistics_beside_a_zip(tmp_path, path):
 
 def test_warns_if_a_zip_does_not_tell_about_normalization(tmp_path):
     saved(tmp_path, "dqn", "cartpole", normalized=False)
-    with pytest.warns(UserWarning, match="does not say whether it was trained behind VecNormalize"):
+    with pytest.warns(UserWarning, match="does not say whether it was trained with VecNormalize"):
         load_sb3_zip(tmp_path / "policy.zip", "dqn", True)
 
 
@@ -238,7 +238,7 @@ def test_raises_if_last_observations_in_a_zip_are_normalized(tmp_path):
     # The pole is at more than its 24 degrees.
     model._last_obs = model._last_obs + np.float32([0.0, 0.0, 1.0, 0.0])
     model.save(tmp_path / "policy.zip")
-    with pytest.raises(ValueError, match="lie outside of its observation space"):
+    with pytest.raises(ValueError, match="are outside its observation space"):
         load_sb3_zip(tmp_path / "policy.zip", "dqn", True)
 
 
@@ -252,7 +252,7 @@ def test_raises_for_files_without_the_policys_statistics(half, tmp_path):
     (tmp_path / "bomb.pkl").write_bytes(pickle.dumps(Bomb()))
     VecNormalize(codrl_mj.make_sb3_vec_env(TASK_IDS["cartpole"], 1)).save(tmp_path / "cartpole.pkl")
     for name, message in {
-        "none.pkl": "no such file; name what VecNormalize.save wrote",
+        "none.pkl": "no such file; name the file that VecNormalize.save wrote",
         "text.pkl": "must be a file that VecNormalize.save wrote",
         "list.pkl": "holds a list: must be a file that VecNormalize.save wrote",
         "cartpole.pkl": (
@@ -268,7 +268,7 @@ def test_raises_for_files_without_the_policys_statistics(half, tmp_path):
 
 def test_raises_for_statistics_without_a_zip(capsys):
     assert main(["evaluate", "runs/mine", "--normalize", "statistics.pkl"]) == 2
-    assert "runs/mine is no zip of Stable-Baselines3: leave it out" in capsys.readouterr().err
+    assert "runs/mine is not a Stable-Baselines3 zip: omit the flag" in capsys.readouterr().err
 
 
 # -- units -----------------------------------------------------------------------------------------
@@ -293,7 +293,7 @@ def test_volts_are_not_exported_as_torques(volts, tmp_path, capsys):
         error = capsys.readouterr().err
         assert "action_space: the policy was trained with Box(-12.0, 12.0, (1,), float32)" in error
         assert (
-            "pendulum as it is set has Box(-2.0, 2.0, (1,), float32): set what it was trained with"
+            "but pendulum now has Box(-2.0, 2.0, (1,), float32): repeat the settings of its training"
             in error
         )
         assert "--env.action" in error
@@ -346,7 +346,7 @@ def test_raises_for_other_observations(tmp_path, capsys):
     model_of("ppo", envs).save(tmp_path / "current.zip")
     assert main(["export", "stacked.zip", *ZIP]) == 2
     assert (
-        "(4 times as many: stacked frames, as of VecFrameStack, are not supported)"
+        "(4 times as many: stacked frames, as with VecFrameStack, are not supported)"
         in capsys.readouterr().err
     )
     assert main(["export", "current.zip", *ZIP]) == 2
@@ -378,7 +378,7 @@ def test_run_is_exported_with_the_environment_of_its_training(tmp_path, capsys):
     for flags, names in {"--actuator ideal": "actuator", "--env.action voltage": "action"}.items():
         assert main(["export", "run", *flags.split()]) == 2
         assert (
-            f"{names}: the environment that run was trained in"
+            f"{names}: export uses the environment in which run was"
             in capsys.readouterr().err.replace("actuator.controller", "")
         )
     assert main(["export", "run", "--episodes", "1"]) == 0

@@ -20,7 +20,7 @@ from codrl_mj.actuators import (
     TorqueSpeed,
     UnstableError,
 )
-from codrl_mj.actuators.model import Nothing
+from codrl_mj.actuators.model import Empty
 from codrl_mj.fields import real
 
 MOTOR = GearMotor(0.5, 2e-4, 0.05, 0.05, rotor_inertia=1e-6, gear_ratio=20.0)
@@ -101,9 +101,9 @@ class Spring(ActuatorModel):
         torque = -parameters.stiffness * inputs.position - parameters.damping * inputs.speed
         if inputs.speed != 0.0:
             torque -= parameters.dry * math.copysign(1.0, inputs.speed)
-        return Nothing(), torque + inputs.desired_torque, Nothing()
+        return Empty(), torque + inputs.desired_torque, Empty()
 
-    State: ClassVar[type] = Nothing
+    State: ClassVar[type] = Empty
 
 
 @pytest.mark.parametrize("shares", [(4.0, 0.0), (0.0, 2.0), (2.0, 1.0)])
@@ -140,7 +140,7 @@ def test_a_torque_speed_line_that_overshoots_is_refused():
         assert (np.ptp(speeds[-20:]) > 1.0) == swings
         if swings:
             with pytest.raises(
-                UnstableError, match=r"takes 2\.1 of the way .* less than 0\.00952 s"
+                UnstableError, match=r"by 2\.1 times its distance .* less than 0\.00952 s"
             ):
                 codrl_mj.add_motors(hinge(inertia), {"it": line})
         else:

@@ -70,7 +70,7 @@ def test_environment_checkers_warn_only_about_spaces(check, task, physics, setup
 @pytest.mark.parametrize("task", matrix_params(["pendulum"], REBUILT))
 def test_gymnasiums_checker_does_not_warn_about_rendering(task, monkeypatch):
     # pygame may not be installed.
-    monkeypatch.setattr("codrl_mj.envs.single.Window", unittest.mock.Mock())
+    monkeypatch.setattr("codrl_mj.envs.single.DisplayWindow", unittest.mock.Mock())
     env = make(task, "force", render_mode="rgb_array", width=64, height=48)
     blank = Blank(env.action_space, env.observation_space)
     assert _warnings_of(check_env, env.unwrapped) <= _warnings_of(

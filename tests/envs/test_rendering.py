@@ -11,7 +11,7 @@ from gymnasium.error import DependencyNotInstalled
 
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.physics import PHYSICS
-from codrl_mj.physics.offscreen import OffscreenRenderer, RenderingUnavailableError, Window
+from codrl_mj.physics.offscreen import DisplayWindow, OffscreenRenderer, RenderingUnavailableError
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import every_rebuilt
 
@@ -93,7 +93,7 @@ def test_environments_that_render_alternately_keep_their_own_views(make):
 @every_physics
 def test_every_step_of_the_human_mode_is_shown_in_a_window(make, monkeypatch, physics):
     window = unittest.mock.MagicMock()
-    monkeypatch.setattr("codrl_mj.envs.single.Window", window)
+    monkeypatch.setattr("codrl_mj.envs.single.DisplayWindow", window)
     windowed, pictured = (
         make("pendulum", physics=physics, render_mode=mode) for mode in ("human", "rgb_array")
     )
@@ -117,7 +117,7 @@ def test_a_window_shows_an_image_the_right_way_round(monkeypatch):
     pygame = unittest.mock.MagicMock()
     monkeypatch.setitem(sys.modules, "pygame", pygame)
     image = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
-    window = Window(3, 2)
+    window = DisplayWindow(3, 2)
     window.show(image, 30.0)
     pygame.display.set_mode.assert_called_once_with((3, 2))
     (array,) = pygame.surfarray.make_surface.call_args.args
@@ -135,7 +135,7 @@ def test_a_window_shows_an_image_the_right_way_round(monkeypatch):
 def test_pygame_shows_an_image(monkeypatch):
     pygame = pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    window = Window(3, 2)
+    window = DisplayWindow(3, 2)
     image = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
     window.show(image, 1000.0)
     np.testing.assert_array_equal(

@@ -215,7 +215,7 @@ def test_the_command_line_identifies_and_randomizes_within_the_intervals(tmp_pat
     assert f"motor.resistance=loguniform({low!r}, {high!r})" in config.randomize
     words[2] = "weak"
     verb = tyro.cli(train_verb(words), args=words)
-    with pytest.raises(ValueError, match="identified: draws within the intervals of a file"):
+    with pytest.raises(ValueError, match="identified: needs the intervals of an actuator file"):
         build_env_config(verb, "pendulum", verb.actuator_name, EnvConfig("pendulum"))
     refused = tmp_path / "refused"
     assert main(f"{line} torque_constant=0.05 back_emf_constant=0.05 --out {refused}".split()) == 1

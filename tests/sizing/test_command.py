@@ -185,7 +185,10 @@ def test_step_compares_all_kinds_of_anti_windup(capsys):
         ("step lag", "no motor"),
         ("show rev-neo --gear-ratio 0", "GearMotor.gear_ratio = 0.0: must be a finite number > 0"),
         ("design rev-neo --bandwidth 9000", "must be <= 3183.1 Hz at sample_rate = 20000 Hz"),
-        ("design rev-neo --delayed --no-delayed", "--delayed and --no-delayed: give one of them"),
+        (
+            "design rev-neo --delayed --no-delayed",
+            "--delayed and --no-delayed: use only one of them",
+        ),
         ("show rev-neo --voltage 0.001 --out here", "a voltage that overcomes the friction"),
         ("show nothing.toml", "there is no such file; codrl-mj motor new nothing.toml writes one"),
         ("new nothing.txt", "nothing.txt: must end in .toml"),

@@ -89,7 +89,7 @@ def error_of(capsys, *line):
         ("--actuator ideal", "env.actuator.motor.resistance: 1.0 and 'absent'"),
         ("--config other.yaml", "seed: 0 and 9"),
         ("--agent dqn", "{} is a training of ppo and continues unchanged"),
-        ("--settings paper", "leave --agent and --settings out"),
+        ("--settings paper", "omit --agent and --settings"),
         ("--out elsewhere", "a run continues in its own folder, {}"),
     ],
 )
@@ -146,18 +146,18 @@ def test_flags_that_contradict_a_run_raise(capsys, run, flags, expected):
         ("evaluate unfinished", "unfinished is not finished"),
         (
             "evaluate unfinished",
-            "codrl-mj train --resume unfinished, or take its best one so far with --which best",
+            "codrl-mj train --resume unfinished, or use its best policy so far with --which best",
         ),
         ("evaluate run --task pendulum", "run was trained for cartpole"),
-        ("evaluate run --agent dqn", "run was trained by ppo: leave --agent out"),
+        ("evaluate run --agent dqn", "run was trained by ppo: omit --agent"),
         ("evaluate alone", "name it with --task"),
         ("evaluate alone --task pendulum", "observation_space: the policy was trained with Box"),
-        ("evaluate alone --task cartpole --which best", "leave --which out"),
+        ("evaluate alone --task cartpole --which best", "omit --which"),
         # A zip file may contain code, and is loaded only with --trust.
-        ("evaluate model.zip --task cartpole --agent ppo", "Pass --trust if that author is you"),
+        ("evaluate model.zip --task cartpole --agent ppo", "Pass --trust if you are the author"),
         (
             "render model.zip --task cartpole --agent ppo --out film.gif",
-            "Pass --trust if that author is you",
+            "Pass --trust if you are the author",
         ),
         ("evaluate nowhere.zip --task cartpole --agent ppo", "no model at nowhere.zip"),
         ("evaluate model.zip --agent ppo --trust", "name it with --task"),
@@ -169,7 +169,7 @@ def test_flags_that_contradict_a_run_raise(capsys, run, flags, expected):
         ),
         (
             "evaluate model.zip --task cartpole --which best",
-            "no run folder and has a single policy",
+            "not a run folder and has a single policy",
         ),
     ],
 )

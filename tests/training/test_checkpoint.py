@@ -275,4 +275,4 @@ def test_a_full_disk_before_a_checkpoint_names_the_remaining_files(tmp_path, cap
         assert main(["train", "--config", str(yaml), "--out", str(out), "--no-tensorboard"]) == 2
     error = capsys.readouterr().err
     assert "no checkpoint" in error
-    assert ("its best policy so far" in error) == best == out.exists()
+    assert ("best policy so far" in error) == best == out.exists()

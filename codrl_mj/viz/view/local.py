@@ -65,7 +65,7 @@ def _check_requests() -> Iterator[None]:
     @functools.wraps(original)
     def serve(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
         def check_request(connection: Any, request: Request) -> Response | None:
-            if not is_allowed(request.headers):
+            if not is_same_origin(request.headers):
                 return Response(
                     http.HTTPStatus.FORBIDDEN, "Forbidden", Headers({"Content-Length": "0"}), b""
                 )
@@ -90,7 +90,7 @@ def _check_requests() -> Iterator[None]:
         websockets.asyncio.server.serve = original  # type: ignore[misc]
 
 
-def is_allowed(headers: Any) -> bool:
+def is_same_origin(headers: Any) -> bool:
     """Return True if a request comes from this server's own page, or from no page at all."""
     host, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(host) != 1 or urlsplit(f"//{host[0]}").hostname not in _HOST_NAMES:
