@@ -334,9 +334,9 @@ def test_an_angle_command_has_no_tracking_measures():
 
 
 def test_a_film_shows_the_voltage_of_every_family_with_one(monkeypatch):
-    assert strip._signal(Position()) == ("voltage", "u [V]")
-    assert strip._signal(IDEAL) == (None, "u [V]")
-    assert strip._signal(Lag()) == (None, "")
+    assert strip._second_signal(Position()) == ("voltage", "u [V]")
+    assert strip._second_signal(IDEAL) == (None, "u [V]")
+    assert strip._second_signal(Lag()) == (None, "")
     drawn = []
     monkeypatch.setattr(
         strip, "_pixels", lambda figure: drawn.append(figure) or np.zeros((1, 1, 3), np.uint8)

@@ -13,7 +13,7 @@ import codrl_mj
 from codrl_mj.actuators import DCMotorActuator, family_id
 from codrl_mj.cli import main
 from codrl_mj.physics import motors
-from codrl_mj.runs.files import sealed
+from codrl_mj.runs.files import with_digest
 from tests.add_motors.models import arm
 
 RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
@@ -53,6 +53,6 @@ def test_a_run_with_an_old_class_is_refused_by_its_name(tmp_path, capsys):
     config = json.loads((run / "config.json").read_text())
     config["train"]["env"]["actuator"]["family"] = OLD_CLASS
     del config["sha256"]
-    (run / "config.json").write_text(json.dumps(sealed(config)))
+    (run / "config.json").write_text(json.dumps(with_digest(config)))
     assert main(["evaluate", str(run), "--trust"]) == 2
     assert OLD_CLASS in " ".join(capsys.readouterr().err.split())
