@@ -344,7 +344,7 @@ def test_load_family_raises_if_two_families_have_the_same_number(monkeypatch):
         pass
 
     monkeypatch.setattr(
-        "codrl_mj.engine.families.family_number",
+        "codrl_mj.engine.families.family_id",
         lambda family: family_id(Spring),  # noqa: ARG005
     )
     with pytest.raises(
