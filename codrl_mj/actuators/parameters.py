@@ -17,7 +17,10 @@ def family_of(actuator: Any) -> Any:
 
 @functools.cache
 def _fields(cls: type) -> dict[str, dataclasses.Field[Any]]:
-    """The fields of a dataclass by name: an environment with several motors asks some thousand times."""
+    """Return the fields of a dataclass by name.
+
+    The result is cached: an environment with several motors needs it thousands of times.
+    """
     return {field.name: field for field in dataclasses.fields(cls)}
 
 

@@ -96,7 +96,10 @@ def advance_winding(
     command: float,
     speed: float,
 ) -> tuple[Winding, float, float, int, float, float]:
-    """Replace `codrl_mj.actuators.shaft.advance_winding`: the board closes the loop, sample by sample."""
+    """Advance the winding with a loop that the board closes, sample by sample.
+
+    It replaces `codrl_mj.actuators.shaft.advance_winding`.
+    """
     # Over a sample the voltage is constant, so the current decays exponentially from its value to
     # its steady state. `decayed` is the share of the distance that it covers.
     x = resistance / (parameters.sample_rate * parameters.inductance)

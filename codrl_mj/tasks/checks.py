@@ -164,8 +164,8 @@ def _call_function(task: Any, name: str, names: str, *arguments: Any) -> Any:
     # Entries must be finite, but a start may have an infinite reward.
     if (~np.isfinite(array) if names else np.isnan(array)).any():
         raise ValueError(
-            f"{source_location(function)}: returns {value} for a state where an episode may start: must be"
-            " finite"
+            f"{source_location(function)}: returns {value} for a state where an episode may start:"
+            " must be finite"
         )
     return value
 

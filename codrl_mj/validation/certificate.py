@@ -178,12 +178,12 @@ _IMPURE_FUNCTION = (
     f" {REPORT}"
 )
 _VIOLENT_RUN = (
-    "if the check passes on a gentler run in Task.reference_states, this run was too violent; if not,"
-    f" {REPORT}"
+    "if the check passes on a gentler run in Task.reference_states, this run was too violent; if"
+    f" not, {REPORT}"
 )
 _DIFFERENT_MODELS = (
-    "your model and your reference environment (Task.reference_env) differ: compare masses, gravity and the"
-    " integrator"
+    "your model and your reference environment (Task.reference_env) differ: compare masses, gravity"
+    " and the integrator"
 )
 _LIKELY_CAUSES = {
     "dynamics": _DIFFERENT_MODELS,
@@ -228,7 +228,8 @@ def validate(
     """Run the checks on tasks and return their certificate.
 
     A custom task runs through all checks that apply to it. Checks that need a reference environment
-    (`Task.reference_env`), or the states and the run of `Task.reference_states`, are skipped if the task has none.
+    (`Task.reference_env`), or the states and the run of `Task.reference_states`, are skipped if the
+    task has none.
 
     Args:
         tasks: name of a task, several names, or None for all registered tasks.

@@ -15,8 +15,8 @@ from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationConfig
 from codrl_mj.tasks import Task, resolve_actuators
 
 NO_REFERENCE_ENV = (
-    "the task has no reference environment (Task.reference_env): there is no second implementation of its"
-    " mechanics"
+    "the task has no reference environment (Task.reference_env): there is no second"
+    " implementation of its mechanics"
 )
 """Reason for skipping checks that need a reference environment."""
 PHYSICS = (("MuJoCo", MujocoPhysics), ("analytic", AnalyticPhysics))

@@ -59,7 +59,7 @@ from codrl_mj.validation.table import (
 
 
 def free_run(task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return initial state and forces of the run of `Task.reference_states`, or of a few steps without one.
+    """Return initial state and forces of the run of `Task.reference_states`, or of a short run.
 
     The run is the same on every call.
 
@@ -228,7 +228,8 @@ def continuous_actuators(task: Task) -> tuple[DCMotorActuator, ...]:
 
 def halving_range(task: Task, max_halvings: int = 4) -> range:
     """Return the numbers of extra halvings of the steps that are tried until the order shows."""
-    # Without `Task.reference_states` the run is arbitrary and may be violent: it begins with finer steps.
+    # Without `Task.reference_states` the run is arbitrary and may be violent: it begins with finer
+    # steps.
     first = 2 if task.reference_states is None else 0
     return range(first, first + (1 if is_ours(task) else max_halvings + 1), 2)
 
@@ -271,8 +272,8 @@ def _step_counts(
         return 2 ** (np.arange(2, 6 if quick else 7) + extra_halvings)
     if not motors:
         return 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + extra_halvings)
-    # Steps of a quarter of the winding's time constant, and shorter. Without `Task.reference_states` they are
-    # also short for the motion (`halving_range`).
+    # Steps of a quarter of the winding's time constant, and shorter. Without
+    # `Task.reference_states` they are also short for the motion (`halving_range`).
     steps_per_quarter = task.step_duration / (
         min(motor.electrical_time_constant for motor in motors) / 4
     )

@@ -1,10 +1,10 @@
 """Comparison of whole runs in MuJoCo with Gymnasium under the same commands.
 
 In MuJoCo the motor runs in the callback, beside Gymnasium in plain Python. A run is checked twice.
-Up to the horizon of `Task.reference_states` the difference itself must stay below 1e-9. Over a whole episode
-a chaotic task enlarges even the smallest rounding beyond any fixed bound. There the difference is
-divided by the growth of rounding errors in the oracle along the same run (`Growth`), which
-separates the port's error from its amplification by chaos.
+Up to the horizon of `Task.reference_states` the difference itself must stay below 1e-9. Over a
+whole episode a chaotic task enlarges even the smallest rounding beyond any fixed bound. There the
+difference is divided by the growth of rounding errors in the oracle along the same run (`Growth`),
+which separates the port's error from its amplification by chaos.
 """
 
 import copy

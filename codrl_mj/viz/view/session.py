@@ -256,7 +256,7 @@ class Session:
         The motion continues, and the motor's state is reset.
         """
         for name in reversed(path):
-            # `override_actuator` takes nested mappings: turn the path into one, from the inside out.
+            # `override_actuator` takes nested mappings: nest the path, from the inside out.
             value = {name: value}
         self._rebuild(
             lambda: {
