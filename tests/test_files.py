@@ -119,7 +119,7 @@ def test_changed_content_is_refused_until_its_digest_is_deleted(tmp_path, change
     write_json(path, content)
     with pytest.raises(
         ValueError,
-        match=r"a\.json is not the thing that was written: .* delete its entry sha256 if",
+        match=r"a\.json is not the thing that was written: .* delete the entry sha256 if",
     ):
         read_json(path, "thing")
     del content["sha256"]

@@ -122,7 +122,7 @@ def test_two_motors_have_two_forces_within_their_own_limits():
         ({"actuator": "lag", "physics": "analytic"}, "arm has no counterpart in Gymnasium"),
         (
             {"actuator": "weak"},
-            "'weak': a variation of the paper's actuator, but arm has none",
+            "'weak': is a variation of the paper's actuator, but arm has no such actuator",
         ),
     ],
 )

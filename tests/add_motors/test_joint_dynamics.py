@@ -185,7 +185,7 @@ def test_configurations_without_joint_dynamics_are_unchanged():
 @pytest.mark.parametrize(
     ("task", "value", "message"),
     [
-        ("HalfCheetah-v5", "both", "joint_dynamics = 'both': must be keep or replace"),
+        ("HalfCheetah-v5", "both", "joint_dynamics = 'both': must be keep, replace, or None"),
         ("pendulum", "replace", "joint_dynamics = 'replace': pendulum has none"),
     ],
 )

@@ -152,8 +152,8 @@ def test_another_process_has_the_same_motors_and_a_model_cannot_import_code(tmp_
     without, refused, *outputs = result.stdout.splitlines()
     assert "plugin codrl_mj.actuator not found" in without
     assert (
-        "its family 'tests.add_motors.models:Worn' is not loaded, and a model cannot have"
-        " it imported" in refused
+        "its family 'tests.add_motors.models:Worn' is not loaded, and a model must not"
+        " import code" in refused
     )
     expected = []
     for model in (ours.compile(), ours.compile(), custom.compile()):

@@ -60,7 +60,7 @@ def test_the_command_that_continues_a_run_works_and_has_trust_if_needed(trained,
     half = Path(shutil.copytree(trained, "half a run"))
     (half / "result.json").unlink()
     assert main(["evaluate", str(half)]) == 2
-    (following,) = printed(capsys.readouterr().err.partition(", or take")[0])
+    (following,) = printed(capsys.readouterr().err.partition(", or ")[0])
     assert following == ["train", "--resume", "half a run"]
     text = (half / "config.json").read_text()
     (half / "config.json").write_text(text.replace('"task": "cartpole"', '"task": "nobodys:TASK"'))

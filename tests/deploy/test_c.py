@@ -257,7 +257,7 @@ def test_servo_loops_in_c_equal_the_servos_sample_by_sample(tmp_path, name, doub
             )
         target += random.uniform(-0.01, 0.01)
         position, speed = 0.9 * position + random.uniform(-1.0, 1.0), random.uniform(-20.0, 20.0)
-        rate = (target - ours.target) / period if ours.due > 0.0 else 0.0
+        rate = (target - ours.target) / period if ours.expected_time > 0.0 else 0.0
         if not double:
             state[0] = ours.velocity_integral
         inputs = Inputs(target, position, speed, sample * period, 0.0)

@@ -129,7 +129,7 @@ def test_check_field_raises_for_a_field_at_another_offset(struct_name, field, mo
         struct_name,
         [*members[:index], ("added_by_a_new_version", ctypes.c_int64), *members[index:]],
     )
-    with pytest.raises(LayoutError, match="where its layout says, expected"):
+    with pytest.raises(LayoutError, match="at its declared offset, expected"):
         _check()
 
 

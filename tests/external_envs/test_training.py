@@ -153,7 +153,7 @@ def test_a_file_assigns_actuators_to_patterns(tmp_path):
         ),
         (
             {"task": "HalfCheetah-v5", "actuator": "paper"},
-            "but the environment HalfCheetah-v5 has none",
+            "but the environment HalfCheetah-v5 has no such actuator",
         ),
         ({"task": "HalfCheetah-v5", "max_episode_steps": 0}, "must be an integer >= 1"),
         ({"task": "HalfCheetah-v5", "options": {"frame_skip": {1, 2}}}, "that JSON can hold"),

@@ -181,8 +181,8 @@ def test_step_compares_all_kinds_of_anti_windup(capsys):
     ("arguments", "message"),
     [
         ("show maxon-ec45-flat-50", "did you mean 'maxon-ec45-flat-50w'"),
-        ("show ideal", "no motor"),
-        ("step lag", "no motor"),
+        ("show ideal", "is not a drive"),
+        ("step lag", "is not a drive"),
         ("show rev-neo --gear-ratio 0", "GearMotor.gear_ratio = 0.0: must be a finite number > 0"),
         ("design rev-neo --bandwidth 9000", "must be <= 3183.1 Hz at sample_rate = 20000 Hz"),
         (

@@ -180,7 +180,7 @@ def test_the_default_actuator_is_the_motor_of_the_catalog():
         *(
             (
                 {"actuator": name},
-                f"'{name}': a variation of the paper's actuator, but furuta has none",
+                f"'{name}': is a variation of the paper's actuator, but furuta has no such actuator",
             )
             for name in NAMED
             if name != "ideal"
