@@ -115,7 +115,8 @@ def test_a_custom_family_raises_exactly_if_the_jury_criterion_fails(shares):
         spring = Spring(stiffness=factor * stiffness, damping=factor * damping)
         if refused:
             with pytest.raises(
-                UnstableError, match=r"inertia at its shaft is 0\.02 kg\*m\^2.* Or shorten the step to 0\.005 s"
+                UnstableError,
+                match=r"inertia at its shaft is 0\.02 kg\*m\^2.* Or shorten the step to 0\.005 s",
             ):
                 codrl_mj.add_motors(hinge(inertia), {"it": spring})
         else:
