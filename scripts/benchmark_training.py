@@ -393,7 +393,7 @@ CONTENDERS: dict[str, tuple[Callable[[str, int, Watch], None], str | None]] = {
 
 def contend(task: str, contender: str, seeds: list[int]) -> None:
     """Train a contender with some seeds in this process, and append a row for each."""
-    # One core for all contenders, whatever number of threads their libraries start.
+    # All libraries run on one core, even if they start several threads.
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     train, actuator = CONTENDERS[contender]
     for seed in seeds:

@@ -124,7 +124,7 @@ class ModelPatcher:
 def motors_added(
     actuators: Mapping[Any, Any], allow_unstable: bool = False, joint_dynamics: str | None = None
 ) -> Iterator[None]:
-    """Add motors to every environment that is built in a `with` block, whatever its library.
+    """Add motors to each environment that any library builds in a `with` block.
 
     Models that this thread builds by `mujoco.MjModel.from_xml_path` or `from_xml_string` in the
     block pass through `codrl_mj.add_motors`. In nested blocks the innermost applies. An environment

@@ -278,7 +278,7 @@ def _widen_by_constant(
     relative = max(constant.high - constant.value, constant.value - constant.low) / max(
         constant.value, 1e-12
     )
-    # A known torque or inertia fixes the scale of all torques, whatever the constant is.
+    # A known torque or inertia fixes the scale of all torques. The constant has no effect on it.
     has_torque_scale = "mgl" in known or "inertia" in known
     for estimate in estimates:
         is_independent = estimate.name in ("gear_efficiency", "stribeck_speed") or (

@@ -166,7 +166,7 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
                 for severity in axis.severities[1:]
                 if (loss := evidence.loss(task, name, severity))
             ]
-            # Only severities below the first harmful one count, whatever follows.
+            # Only severities below the first harmful one count. Later ones are ignored.
             harmless = [
                 severity
                 for severity, _ in itertools.takewhile(lambda pair: pair[1].is_negligible, known)

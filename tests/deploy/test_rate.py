@@ -1,4 +1,4 @@
-"""Tests that the exported rate is the rate of actions, whatever the model's integration step is."""
+"""Tests that the exported rate is the rate of actions and not that of integration steps."""
 
 import functools
 

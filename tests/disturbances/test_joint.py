@@ -109,7 +109,7 @@ def test_the_explicit_integrator_stays_explicit():
 
 
 def test_armature_is_an_inertia_of_the_joint():
-    """Check that the pendulum starts with tau/(m l^2/3 + I), whatever gravity adds."""
+    """Check that the pendulum starts with tau/(m l^2/3 + I), plus the acceleration by gravity."""
     rotor, torque = 0.25, 1.5
     physics = MujocoPhysics(
         SimulationConfig(
