@@ -175,7 +175,7 @@ class Gearbox(ActuatorModel):
     State: ClassVar[type] = State
     Signals: ClassVar[type] = Signals
     advance: ClassVar = staticmethod(advance)
-    efficiency: float = real(0.8, above=0, most=1)
+    efficiency: float = real(0.8, above=0, maximum=1)
     time_constant: float = real(0.05, above=0)
 """
 

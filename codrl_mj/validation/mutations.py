@@ -183,7 +183,7 @@ _WARM_WINDING: Edit = (
     "parameters, resistance, timestep, samples",
     "parameters, 1.01 * resistance, timestep, samples",
 )
-_COMMIT = "                commit_slot(number, slot, time)\n"
+_COMMIT = "                commit_slot(family_number, slot, time)\n"
 _LATE_FORCE: tuple[Edit, ...] = (
     (
         _COMMIT,
@@ -196,7 +196,7 @@ _LATE_FORCE: tuple[Edit, ...] = (
 )
 _EVERY_PASS: Edit = ("if time != f64(slot)[0]:", "if True:")
 _EVERY_STAGE: Edit = ("if DATA.pbase(data) != 0:", "if False:")
-_ADVANCED = "if family_size(number, INERTIA) else math.inf,\n            )\n"
+_ADVANCED = "                else math.inf,\n            )\n"
 _CANDIDATE = SLOT_HEADER_SIZE + len(current_loop.State._fields)
 _SHARED_CURRENT: tuple[Edit, ...] = (
     (_COMMIT, f"{_COMMIT}                f64(slot)[{SLOT_HEADER_SIZE}] = f64(HIDDEN)[0]\n"),
@@ -216,10 +216,10 @@ def _late(self: Any, desired_force: float) -> Any:
     return _STEP(self, force)
 
 
-def _explicit(self: Any, config: Any) -> None:
+def _explicit(self: Any, simulation: Any) -> None:
     """Create the physics with the other Euler integrator."""
-    wrong_integrator = "semi-implicit" if config.integrator == "euler" else "euler"
-    _MAKE(self, dataclasses.replace(config, integrator=wrong_integrator))
+    wrong_integrator = "semi-implicit" if simulation.integrator == "euler" else "euler"
+    _MAKE(self, dataclasses.replace(simulation, integrator=wrong_integrator))
 
 
 def _warm(self: Any, state: np.ndarray, key: float = 0.0) -> None:
