@@ -4,8 +4,9 @@
     >>> import codrl_mj
     >>> env = gym.make("codrl_mj/CartPole-v0", actuator="weaker")
 
-Importing the package registers its environments with Gymnasium, which has loaded no plugins since
-version 1.0. Every public name is imported on first use, so that `import codrl_mj` is fast.
+Importing the package registers its environments with Gymnasium. The import is necessary, because
+Gymnasium loads no plugins since version 1.0. Every public name is imported on first use, so that
+`import codrl_mj` is fast.
 """
 
 import importlib
@@ -51,7 +52,7 @@ def _exit_on_interrupt(*_: object) -> None:
 
 
 def _is_command_line() -> bool:
-    """Return True in the process of the command line, if Ctrl-C still has Python's handler."""
+    """Return True if this process is the `codrl-mj` command and Ctrl-C has Python's handler."""
     # `pathlib` would have to be imported first, which takes time.
     program = os.path.basename((getattr(sys, "argv", None) or [""])[0])  # noqa: PTH119
     is_command = program == "codrl-mj" or (program == "-m" and "codrl_mj" in sys.orig_argv)
@@ -80,7 +81,7 @@ def __dir__() -> list[str]:
 
 if _is_command_line():
     signal.signal(signal.SIGINT, _exit_on_interrupt)
-# The plugin's module imports mujoco, which reads the variable: the order matters.
+# This comes before the plugin's module, which imports mujoco: mujoco then reads MUJOCO_GL.
 _choose_headless_backend()
 importlib.import_module("codrl_mj.plugin").register()
 # Importing the tasks registers them with Gymnasium.

@@ -1,15 +1,15 @@
 """Compiled functions on disk: the first process compiles, later processes load the machine code.
 
-Machine code fits one CPU and everything that was compiled into it. The key of a file therefore
-contains: bytecode, constants, closure values and globals of every function that is reached, and
-the source files of users' functions; all of this package's source; MuJoCo's memory layout, whose
-offsets are constants in the code; versions, CPU and numba's settings. A function with a value that
-cannot be hashed is not stored. Compiled code refers to addresses of this process by symbol names
-(`register_symbol`).
+Machine code is valid only for one CPU, and for the code and the constants that it was compiled
+from. The key of a file therefore contains: bytecode, constants, closure values and globals of every
+function that is reached, and the source files of users' functions; all of this package's source;
+MuJoCo's memory layout, whose offsets are constants in the code; versions, CPU and numba's settings.
+A function with a value that cannot be hashed is not stored. Addresses differ between processes, so
+compiled code refers to them by the names of symbols (`register_symbol`).
 
 The folder is the user's cache folder, or CODRL_MJ_CACHE; with `off` nothing is stored. numba
 unpickles parts of the files, so folder and files are only used if they belong to the user and no
-other user may write them. A file is written completely or not at all; a damaged file counts as
+other user may write to them. A file is written completely or not at all; a damaged file counts as
 missing.
 """
 
@@ -23,7 +23,7 @@ import platform
 import secrets
 import sys
 import tempfile
-import types as python
+import types as python_types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -81,9 +81,9 @@ def cache_folder() -> Path | None:
 def _randomize_function_ids() -> None:
     """Make numba's names for functions unique among all processes.
 
-    numba distinguishes functions of one name by a count, also in symbols that the linker sees. If
-    two processes gave two functions the same name, the linker would take one for the other when
-    both are loaded.
+    numba counts functions, and the count is part of the symbol of each function. If two processes
+    gave the same symbol to different functions, the linker would confuse these functions in a
+    process that loads both from the cache.
     """
     FunctionIdentity._unique_ids = itertools.count(secrets.randbits(60))  # type: ignore[attr-defined]
 
@@ -94,9 +94,10 @@ if hasattr(os, "register_at_fork"):
 
 
 def register_symbol(name: str, address: int) -> str:
-    """Register the name by which compiled code of any process finds this process's address.
+    """Register an address of this process under a symbol's name, by which compiled code finds it.
 
-    If the name already has another address, as after a copy of a module, a new name is returned.
+    If the name already has another address, because a module was imported twice, a new name is
+    registered. The name is returned.
     """
     while _SYMBOLS.setdefault(name, address) != address:
         name += "_"
@@ -112,7 +113,7 @@ def external_function(name: str, function: Any, signature: Any) -> Any:
 
 
 def njit(function: Any = None, **options: Any) -> Any:
-    """Compile a function as `numba.njit` does, for calls from Python, with the cache on disk."""
+    """Compile a function that Python calls, as `numba.njit` does, with the cache on disk."""
     if function is None:
         return functools.partial(njit, **options)
     compiled = numba.njit(function, **options)
@@ -152,7 +153,7 @@ class VerifiedMarker:
 
 
 class _FunctionCache(_Cache):  # type: ignore[misc]
-    """Cache of one function's compiled forms, with the interface that numba expects."""
+    """Cache of one function's overloads, one for each signature, with the interface of numba."""
 
     def __init__(self, kind: str, function: Any, options: Any) -> None:
         self._name, self._key_values = (
@@ -162,7 +163,7 @@ class _FunctionCache(_Cache):  # type: ignore[misc]
 
     @property
     def cache_path(self) -> str:
-        """Folder of the compiled forms."""
+        """Folder of the overloads."""
         return str(cache_folder())
 
     def enable(self) -> None:
@@ -175,27 +176,27 @@ class _FunctionCache(_Cache):  # type: ignore[misc]
         """Do nothing: files are written at once."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load the compiled form for a signature; None if there is no usable file."""
+        """Load the overload for a signature; None if there is no usable file."""
         path = self._overload_path(sig)
         payload = None if path is None else _read(path)
         if payload is None:
             return None
-        # As in numba's own cache: the context must know all registrations before it rebuilds code.
+        # As in numba's own cache: the context must know all registrations before code is rebuilt.
         target_context.refresh()
         try:
             return CompileResult._rebuild(target_context, *pickle.loads(payload))
         except Exception:
-            # Another numba may have written it; it is compiled again.
+            # An entry that numba cannot rebuild counts as missing: the function is compiled again.
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Store a compiled form if it is valid in any process of the user on this machine."""
+        """Store an overload, unless it has parts that only this process can use."""
         path = self._overload_path(sig)
         if path is not None and not data.library.has_dynamic_globals and not data.lifted:
             try:
                 payload = serialize.dumps(data._reduce())
             except Exception:
-                # A part of it cannot be pickled.
+                # The function can be used, but not stored, if a part of it cannot be pickled.
                 return
             _write(path, payload)
 
@@ -212,14 +213,14 @@ def _path(name: str, values: Any) -> Path | None:
             return None
         _hash_value(key, values, (), {})
     except Exception:
-        # Looking at a user's value can raise anything; the function is then compiled in every
-        # process.
+        # Attributes of users' objects may raise any exception when they are read. The function is
+        # then not stored, and every process compiles it.
         return None
     return directory / f"{name}-{key.hexdigest()}.code"
 
 
-def _usable(status: os.stat_result) -> bool:
-    """Return True if a file or folder is the user's, and no other user may write it."""
+def _is_trusted(status: os.stat_result) -> bool:
+    """Return True if a file or folder belongs to the user, and only the user may write to it."""
     return not hasattr(os, "getuid") or (
         status.st_uid == os.getuid() and not status.st_mode & 0o022
     )
@@ -228,10 +229,10 @@ def _usable(status: os.stat_result) -> bool:
 def _read(path: Path) -> bytes | None:
     """Return the content of a file that is usable and complete; otherwise None."""
     try:
-        if not _usable(path.parent.stat()):
+        if not _is_trusted(path.parent.stat()):
             return None
         with path.open("rb") as file:
-            if not _usable(os.fstat(file.fileno())):
+            if not _is_trusted(os.fstat(file.fileno())):
                 return None
             digest, payload = file.read(32), file.read()
         os.utime(path)
@@ -241,10 +242,10 @@ def _read(path: Path) -> bytes | None:
 
 
 def _write(path: Path, payload: bytes) -> None:
-    """Write a file completely or not at all; delete the least recently used files for space."""
+    """Write a file completely or not at all; then limit the folder's size to `MAX_BYTES`."""
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if not _usable(path.parent.stat()):
+        if not _is_trusted(path.parent.stat()):
             return
         # Readers never see an incomplete file, because renaming is atomic.
         handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
@@ -284,13 +285,13 @@ def _base_key() -> bytes:
         platform.machine(),
         sys.version,
     )
-    # The module's own names, such as its file's, are no settings: two installations of one version
-    # share what is kept.
-    named = (
+    # `__file__` and similar names of the module are left out, because they are not settings: two
+    # installations of the same versions can share their files.
+    public_values = (
         (name, value) for name, value in vars(numba.config).items() if not name.startswith("__")
     )
     settings = sorted(
-        (name, repr(value)) for name, value in named if isinstance(value, _PLAIN_TYPES)
+        (name, repr(value)) for name, value in public_values if isinstance(value, _PLAIN_TYPES)
     )
     key.update(repr((cpu, settings)).encode())
     sources = sorted(_PACKAGE.rglob("*.py"))
@@ -318,8 +319,9 @@ def _hash_value(key: Any, value: Any, names: tuple[str, ...], visited: dict[int,
         for element in sorted(value, key=repr) if isinstance(value, frozenset) else value:
             _hash_value(key, element, names, visited)
         return
-    if not isinstance(value, python.ModuleType):
-        # Recursive functions reach themselves: a second visit hashes only the order of the first.
+    if not isinstance(value, python_types.ModuleType):
+        # A recursive function reaches itself. A value that was visited before is hashed by its
+        # number in the order of visits.
         if id(value) in visited:
             key.update(f"again {[*visited].index(id(value))}\n".encode())
             return
@@ -335,9 +337,9 @@ def _hash_value(key: Any, value: Any, names: tuple[str, ...], visited: dict[int,
             )
         case _Intrinsic():
             _hash_value(key, value._defn, names, visited)
-        case python.FunctionType():
+        case python_types.FunctionType():
             _hash_function(key, value, visited)
-        case python.CodeType():
+        case python_types.CodeType():
             parts = (
                 value.co_code,
                 value.co_names,
@@ -351,7 +353,7 @@ def _hash_value(key: Any, value: Any, names: tuple[str, ...], visited: dict[int,
                 names,
                 visited,
             )
-        case python.ModuleType():
+        case python_types.ModuleType():
             key.update(f"module {value.__name__}\n".encode())
             if value.__name__.partition(".")[0] not in _VERSIONED_PACKAGES:
                 for name in names:
@@ -376,7 +378,7 @@ def _hash_value(key: Any, value: Any, names: tuple[str, ...], visited: dict[int,
             _hash_value(
                 key, (value.func, value.args, tuple(sorted(value.keywords.items()))), names, visited
             )
-        case _ if isinstance(value, python.BuiltinFunctionType | np.ufunc) or root in (
+        case _ if isinstance(value, python_types.BuiltinFunctionType | np.ufunc) or root in (
             "numba",
             "numpy",
             "typing",
@@ -387,7 +389,11 @@ def _hash_value(key: Any, value: Any, names: tuple[str, ...], visited: dict[int,
 
 
 def _hash_function(key: Any, function: Any, visited: dict[int, Any]) -> None:
-    """Hash a function: its code, defaults, closure, the globals that it names, its source file."""
+    """Hash a function: its name, code, defaults, closure and globals.
+
+    The source file of a user's function is hashed too. Functions of `_VERSIONED_PACKAGES` are
+    identified by their name, because the packages' versions are in the key.
+    """
     code, scope, root = (
         function.__code__,
         function.__globals__,
@@ -420,5 +426,5 @@ def _hash_function(key: Any, function: Any, visited: dict[int, Any]) -> None:
 
 def _referenced_names(code: Any) -> tuple[str, ...]:
     """Return the names of globals and attributes in a function and the functions inside it."""
-    inner = (constant for constant in code.co_consts if isinstance(constant, python.CodeType))
+    inner = (constant for constant in code.co_consts if isinstance(constant, python_types.CodeType))
     return (*code.co_names, *(name for constant in inner for name in _referenced_names(constant)))

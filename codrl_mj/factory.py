@@ -21,19 +21,20 @@ def make(
         >>> env = codrl_mj.make("pendulum", "maxon-dcx22l")
         >>> env = codrl_mj.make("HalfCheetah-v5", {"b.*": "maxon-ec45-flat-50w", "f.*": "lag"})
 
-    Libraries that start processes need functions that make environments, such as
+    For a library that makes environments in other processes, pass a function, such as
     `functools.partial(codrl_mj.make, "Hopper-v5", "lag")`.
 
     Args:
         env: a task's name or id, such as `pendulum`; the id of a third-party environment;
             `module:NAME` of a custom task or env source; an `EnvConfig`; or a function or class
             that makes an environment, which needs no id.
-        actuator: actuator that transmits the forces: a name, an actuator, or a mapping of patterns
-            of motors to these. None selects a task's own motor, and no motor in other environments.
-            With `"ideal"` an environment is, bit for bit, the one without motors.
-        **arguments: other fields of `EnvConfig`, and options of the task, or of `gymnasium.make`
-            and the environment, such as `render_mode` and `max_episode_steps`; for an `EnvConfig`
-            those of its `make`.
+        actuator: motor that delivers the forces: a name, an `ActuatorModel`, or a mapping from
+            patterns of motor names to these. None selects the default motor of a task, and no motor
+            in other environments. With `"ideal"`, an environment behaves, bit for bit, as it does
+            without motors.
+        **arguments: other fields of `EnvConfig`, options of the task or of the environment's
+            constructor, and arguments of `gymnasium.make`, such as `render_mode` and
+            `max_episode_steps`. With an `EnvConfig`, the arguments of `EnvConfig.make`.
 
     Raises:
         gymnasium.error.UnregisteredEnv: there is no such environment.
@@ -61,26 +62,26 @@ def make_vec(
     actuator: Any = None,
     **arguments: Any,
 ) -> "VectorEnv[Any, Any, Any]":
-    """Create a Gymnasium vector environment, which resets in the step that ends an episode.
+    """Create a Gymnasium vector environment, by default in autoreset mode `SameStep`.
 
         >>> randomize = {"motor.resistance": "uniform(1, 2)"}
         >>> envs = codrl_mj.make_vec("pendulum", 1024, "weak", randomize=randomize)
 
-    Tasks on MuJoCo are stepped as a batch, in threads, and can be rendered too: an
-    `ActuatedVectorEnv`. All others (third-party environments, functions, `physics="analytic"`) are
-    stepped one after the other: a `SerialVectorEnv`. A warning is issued if a task on MuJoCo needs
-    the latter, which `render_mode="human"` does.
+    A task on MuJoCo becomes an `ActuatedVectorEnv`, which steps all environments as a batch, in
+    threads. Everything else (third-party environments, functions, `physics="analytic"`) becomes a
+    `SerialVectorEnv`, which steps one environment after the other. So does a task on MuJoCo with
+    `render_mode="human"`, and a warning says that this is slow.
 
     Args:
         env: as for `make`.
         num_envs: number of environments, >= 1.
-        actuator: as for `make`; for a task also a list with one for each environment.
-        **arguments: as for `make`, and those of the vector: `num_threads` (of a batch),
-            `autoreset_mode` (default `SameStep`), `render_mode`. They have the same meaning with a
-            name and with an `EnvConfig`.
+        actuator: as for `make`; for a task also a list with one actuator for each environment.
+        **arguments: as for `make`, and arguments of the vector environment: `num_threads` (only for
+            a batch), `autoreset_mode`, `render_mode`. They have the same meaning with a name and
+            with an `EnvConfig`.
 
     Raises:
-        ValueError: see `make`; or the memory is too small.
+        ValueError: see `make`; or there is too little memory.
     """
     if not isinstance(env, EnvConfig | str):
         vector_arguments = {
@@ -97,12 +98,11 @@ def make_vec(
 def _resolve_config(
     env: str | EnvConfig, actuator: Any, arguments: dict[str, Any]
 ) -> tuple[EnvConfig, dict[str, Any]]:
-    """Return a name's configuration, and the remaining arguments for its `make` or `make_vec`."""
+    """Return a configuration, and the remaining arguments for its `make` or `make_vec`."""
     if isinstance(env, EnvConfig):
         config = env
     elif ":" in env and not find_source(env).env_id:
-        # For a custom source or a package's environment, keyword arguments that are not fields are
-        # options.
+        # For `module:NAME` and `package:ID`, keyword arguments that are not fields are options.
         names = "max_episode_steps", "render_mode", *VECTOR_ARGUMENTS
         remaining_arguments = {name: arguments.pop(name) for name in names if name in arguments}
         return EnvConfig.from_arguments(

@@ -1,4 +1,4 @@
-"""Dataclass fields with bounds and units; all settings are validated here."""
+"""Dataclass fields with bounds and units, and checks of names, memory and other settings."""
 
 import ast
 import dataclasses
@@ -155,19 +155,19 @@ class Checked:
 
 
 def free_memory() -> int | None:
-    """Return the free memory [bytes]; None if the system, unlike Linux, does not report it."""
+    """Return the free memory [bytes]; None if it is unknown, as on systems other than Linux."""
     meminfo = Path("/proc/meminfo")
     free = re.search(r"MemAvailable:\s*(\d+) kB", meminfo.read_text() if meminfo.exists() else "")
     return 1024 * int(free[1]) if free else None
 
 
 def check_memory(size: float, purpose: str, remedy: str) -> None:
-    """Raise if something takes more memory than is free.
+    """Raise if more memory is required than is free.
 
     Args:
         size: required memory [bytes].
-        purpose: its purpose, with a number, for the message.
-        remedy: setting to change.
+        purpose: setting that requires it, with its value, such as `buffer_size = 1,000`.
+        remedy: instruction at the end of the message, such as `lower it`.
     """
     if (available := free_memory()) is not None and size > available:
         raise ValueError(
@@ -201,7 +201,7 @@ def check_names(
     for name in names:
         if name not in known:
             near = [
-                nearest_name for nearest_name in nested if nearest_name.rpartition(".")[2] == name
+                nested_name for nested_name in nested if nested_name.rpartition(".")[2] == name
             ][:3] or _nearest(name, known)
             near = near or _nearest(name, nested)
             hints = (
@@ -270,37 +270,36 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def _nearest(name: object, known: Iterable[str]) -> list[str]:
-    """Return up to three names that begin with a name or contain all its words, or the closest one.
+    """Return up to three known names that begin with a name or contain all its words.
 
-    If the part before the last dot is known, only the last part is compared, because a common
-    prefix does not make two names more similar.
+    If there are none, or more than three, the closest known name is returned. If the part before
+    the last dot is known, only the last part is compared, because a common prefix does not make two
+    names more similar.
     """
-    text, spelt = str(name).lower(), {known_name.lower(): known_name for known_name in known}
-    with_prefix = [
-        spelt[known_name] for known_name in spelt if len(text) > 2 and known_name.startswith(text)
+    text, originals = str(name).lower(), {known_name.lower(): known_name for known_name in known}
+    completions = [
+        originals[lowered] for lowered in originals if len(text) > 2 and lowered.startswith(text)
     ]
-    if 0 < len(with_prefix) < 4:
-        return with_prefix
-    start, dot, last = text.rpartition(".")
+    if 0 < len(completions) < 4:
+        return completions
+    parent, dot, last = text.rpartition(".")
     ends = {
-        known_name[len(start + dot) :]: known_name
-        for known_name in spelt
-        if dot and known_name.startswith(start + dot)
+        lowered[len(parent + dot) :]: lowered
+        for lowered in originals
+        if dot and lowered.startswith(parent + dot)
     }
     if not ends:
-        ends, last = {known_name: known_name for known_name in spelt}, text
+        ends, last = {lowered: lowered for lowered in originals}, text
     words = _words(last)
     with_same_words = [
-        spelt[known_name]
-        for end, known_name in ends.items()
+        originals[lowered]
+        for end, lowered in ends.items()
         if words and words <= _words(end.rpartition(".")[2])
     ]
     if 0 < len(with_same_words) < 4:
         return with_same_words
     candidates = [end for end in ends if last == text or "." not in end]
-    return [
-        spelt[ends[known_name]] for known_name in difflib.get_close_matches(last, candidates, n=1)
-    ]
+    return [originals[ends[match]] for match in difflib.get_close_matches(last, candidates, n=1)]
 
 
 def _words(name: str) -> set[str]:
@@ -363,7 +362,10 @@ def build(cls: type, mapping: object, label: str, prefix: str = "") -> Any:
 
 
 def part(absent: Any) -> Any:
-    """Return a field for an optional nested dataclass; None, the default, stands for `absent`."""
+    """Return a field for an optional nested dataclass.
+
+    Its default is None. `absent` is the dataclass whose values apply then.
+    """
     return dataclasses.field(default=None, metadata={"absent": absent})
 
 
@@ -380,7 +382,7 @@ def parts(cls: type) -> dict[str, type]:
 
 @functools.cache
 def declared_parts(cls: Any) -> dict[str, Any]:
-    """Return field -> declared type, for fields of `parts` declared as a class or a union."""
+    """Return field -> annotated type, for fields of `parts` annotated with a class or a union."""
     # Names that only a type checker imports cannot be resolved at run time.
     try:
         hints = typing.get_type_hints(cls)
@@ -401,7 +403,7 @@ def _bounded(
     kind: type | None = None,
     between: tuple[float | None, float | None] = (None, None),
 ) -> Any:
-    """Return a field whose metadata hold its check, its unit and its range."""
+    """Return a field with its check, its unit and its range as metadata."""
     metadata = {
         "bound": (is_valid, text, optional or default is None, kind),
         "unit": unit,

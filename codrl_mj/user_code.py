@@ -1,6 +1,7 @@
 """Code and files of users: loading of modules and models by name, and checks of functions.
 
-Functions are called once before they are compiled. Errors in users' code become one sentence.
+Users' functions are called once in plain Python before they are compiled, because numba's errors
+are hard to read. An error in a user's code is reported in one sentence, with file and line.
 """
 
 import codecs
@@ -56,7 +57,7 @@ def check_form(function: Callable[..., Any], value: Any, form: Form, declared: s
         function: the function.
         value: its return value, or the type that numba inferred for it.
         form: the expected form.
-        declared: reference to the description of the form, for the message.
+        declared: documentation of the form, for the message, such as `Task.state_names`.
     """
     if not _fits(value, form):
         raise ValueError(
@@ -115,7 +116,10 @@ def compile_error_message(function: Callable[..., Any], error: Exception) -> str
 
 
 def asset_folder() -> Path:
-    """Return the folder of MJCF files and `motors/`: `assets/`, in a wheel inside the package."""
+    """Return the folder with MJCF files and `motors/`.
+
+    It is `assets/` in the repository, and `_assets/` in the package of an installed wheel.
+    """
     package = Path(__file__).parent
     for folder in (package / "_assets", package.parent / "assets"):
         if folder.is_dir():
@@ -167,7 +171,7 @@ def read_text(path: Path) -> str:
 def read_yaml(path: Path) -> Any:
     """Read a YAML or JSON file, with the numbers of YAML 1.2 and JSON, such as 3e-4 and Infinity.
 
-    The value 20:1 is a text; YAML 1.1 reads it as 1201.
+    For example, 20:1 is text here; YAML 1.1 would read it as the number 1201.
 
     Raises:
         ValueError: the file is not YAML, or a mapping has a key twice.
@@ -208,7 +212,7 @@ class UntrustedCodeError(ValueError):
 
 _IMPORTS_ALLOWED = contextvars.ContextVar("trusted", default=True)
 FILES_TRUSTED = contextvars.ContextVar("files_trusted", default=True)
-"""True if actuator files may name modules; the command line sets it to its `--trust`."""
+"""True if actuator files may name modules; the command line sets it from `--trust`."""
 
 
 @contextlib.contextmanager

@@ -132,7 +132,10 @@ def test_arguments_replace_fields_of_a_configuration(view):
         (("pendulum", "wek"), "wek"),
         (("pendulum", {"leg": "lag"}), "leg"),
         (("Reacher-v5", {"leg.*": "lag"}), "leg"),
-        (("Reacher-v5", {}), r"actuator = \{\}: must be one for all motors, or a mapping of pat"),
+        (
+            ("Reacher-v5", {}),
+            r"actuator = \{\}: must be one actuator for all motors, or a mapping of pat",
+        ),
     ],
 )
 def test_raises_and_names_what_is_unknown(factory, arguments, message):

@@ -1,10 +1,10 @@
-"""Gymnasium's attributes of environments, for example `env.unwrapped.gravity = 3.7`.
+"""Attributes that Gymnasium's environments have, for example `env.unwrapped.gravity = 3.7`.
 
-`Task.attributes` maps each name to the quantity that it reads and writes; with the analytic
-physics, numbers of the model belong to Gymnasium's environment. A written attribute takes effect at
-once; the state and the motor stay as they are. Written values outlast resets and are not part of a
-`snapshot`. Values that the task's compiled functions contain are read-only; writing the value that
-an attribute already has is always allowed.
+`Task.attributes` maps each name to the quantity that it reads and writes. With the analytic
+physics, Gymnasium's environment holds the numbers of the model. A written attribute takes effect at
+once; the state and the motor stay as they are. Written values persist after a reset and are not
+part of a `snapshot`. Values that are compiled into the task's functions are read-only, but writing
+the value that an attribute already has is always allowed.
 """
 
 import dataclasses
@@ -54,7 +54,7 @@ def read(name: str, setup: ResolvedEnv, model: Any) -> Any:
 
 
 def write(name: str, value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
-    """Write an attribute; `mj_setConst` must be called afterwards.
+    """Write an attribute; the caller must call `mj_setConst` afterwards.
 
     Returns:
         The resolved configuration with the new value.
@@ -76,7 +76,7 @@ def write(name: str, value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
             raise AttributeError(f"it is compiled into the step: make an environment with {known}")
         if setup.randomization.distributions:
             raise AttributeError(
-                "actuator and model are drawn at every reset: give `randomize` a distribution of it"
+                "actuator or model are drawn at every reset: draw this attribute with `randomize`, too"
             )
         if isinstance(attribute, ModelNumber):
             _write_number(name, attribute, value, setup, model)
@@ -104,7 +104,7 @@ def validate_states(states: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _number_view(attribute: ModelNumber, model: Any) -> np.ndarray:
-    """Return a live view of the attribute's number in the model, shape (1,)."""
+    """Return a view of the attribute's number in the model, shape (1,); writes change the model."""
     array, row = field_of(model, attribute.field), 0
     if attribute.owner:
         # MuJoCo's field names begin with the kind of object (`body_mass`), and the model has an
@@ -162,7 +162,7 @@ def _write_number(
 
 
 def _write_forces(value: Any, setup: ResolvedEnv, model: Any, per_action: bool) -> ResolvedEnv:
-    """Write the forces of all actions, or the largest force, with which the others are scaled."""
+    """Write the force of each action; or the largest force, and scale the others in proportion."""
     task = setup.task
     if (
         setup.config.action != "force"
@@ -170,8 +170,8 @@ def _write_forces(value: Any, setup: ResolvedEnv, model: Any, per_action: bool) 
         or len(task.motors) > 1
     ):
         raise AttributeError(
-            "the current loop's table, the drive's disturbances and several motors depend on the"
-            " forces: make an environment of one motor with action='force' and no disturbances"
+            "it can only be written in an environment with one motor, action='force' and no"
+            " disturbances, because other settings depend on it: make such an environment"
         )
     table = task.forces
     if per_action:
@@ -190,7 +190,7 @@ def _write_forces(value: Any, setup: ResolvedEnv, model: Any, per_action: bool) 
 
 
 def _write_step(value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
-    """Write the duration of an environment step [s]; the number of inner steps stays."""
+    """Write the duration of an environment step [s]; the number of inner steps does not change."""
     duration = _finite_number(value, positive=True)
     if setup.simulation.motors_added or setup.config.disturbances != NO_DISTURBANCES:
         raise AttributeError(
@@ -227,7 +227,7 @@ class _AttributeDescriptor:
 
     def __set__(self, env: Any, value: Any) -> None:
         attribute = env.task.attributes.get(self._name)
-        # A descriptor is on the class of all environments; the attribute may be another task's.
+        # All environments share the class, so the descriptor may be of another task's attribute.
         if attribute is None:
             vars(env)[self._name] = value
         else:

@@ -40,12 +40,12 @@ def command_of(actuator: ActuatorModel, name: str, pattern: str = "") -> Command
         )
     command = known[name]
     return command._replace(
-        fixed={field: f"with action={name!r} {why}" for field, why in command.fixed.items()}
+        fixed={field: f"with action={name!r} {reason}" for field, reason in command.fixed.items()}
     )
 
 
 def _servo_remedy(actuator: ActuatorModel, name: str) -> str:
-    """Return a remedy, for drives that do not take position or velocity commands; else empty."""
+    """Return a remedy if a drive does not take a position or velocity command; otherwise empty."""
     if name not in ("position", "velocity") or not isinstance(actuator, Drive):
         return ""
     changes = {} if isinstance(actuator, Servo) else {"family": "servo"}
@@ -81,7 +81,7 @@ class TaskCommands:
             )
         if name == "force" and levels is not None:
             raise ValueError(f"levels = {levels!r}: only for action='current' and action='voltage'")
-        chosen = [command_of(actuator, name) for actuator in actuators]
+        commands = [command_of(actuator, name) for actuator in actuators]
         wrapped = [
             task.state_names[index]
             for index in task.wrapped
@@ -92,22 +92,22 @@ class TaskCommands:
                 f"action = 'position': {task.name} wraps {', '.join(wrapped)}, and a position that"
                 " jumps by one turn cannot be held; use a velocity servo, or another actuator"
             )
-        self.simulated = tuple(command.actuator for command in chosen)
+        self.simulated = tuple(command.actuator for command in commands)
         """Actuator to simulate for each motor; a command may bypass a part of it."""
         self.is_torque_controlled = self.simulated[0].is_torque_controlled
         """True if the command is a torque. If False, `desired_force` equals the delivered force."""
-        self.fixed = chosen[0].fixed
+        self.fixed = commands[0].fixed
         """Fields of the actuator that cannot be randomized -> reason."""
         scales = np.array(
-            [command.torque_per_unit / command.actuator.arm_radius for command in chosen]
+            [command.torque_per_unit / command.actuator.arm_radius for command in commands]
         )
-        limits = [command.limit for command in chosen]
+        limits = [command.limit for command in commands]
         if not all(limit is None or np.isfinite(limit) for limit in limits):
             raise ValueError(f"action = {name!r}: needs a finite controller.max_voltage, it is inf")
         self.force_per_position = np.where(
-            [command.unit in POSITIONS for command in chosen], scales, 0.0
+            [command.unit in POSITIONS for command in commands], scales, 0.0
         )
-        """As `codrl_mj.physics.SimulationConfig.force_per_position`."""
+        """Force per unit of a position command; see `codrl_mj.physics.SimulationConfig`."""
         motors = zip(limits, scales, task.max_forces, strict=True)
         self.max_forces = np.array(
             [max_force if limit is None else limit * scale for limit, scale, max_force in motors]
@@ -136,7 +136,7 @@ class TaskCommands:
             bounds = max_commands.astype(np.float32)
             self.action_space = spaces.Box(-bounds, bounds, dtype=np.float32)
         elif name != "force":
-            table = _discrete_levels(task, name, levels, chosen)
+            table = _discrete_levels(task, name, levels, commands)
             self.action_space, self.action_forces = spaces.Discrete(len(table)), table * scales[0]
 
     def force(self, action: Any) -> Any:
@@ -200,7 +200,7 @@ class TaskCommands:
 def _discrete_levels(
     task: Task, name: str, levels: Sequence[float] | None, commands: Sequence[Command]
 ) -> np.ndarray:
-    """Return the levels that a task's discrete actions choose from, shape (k,), checked."""
+    """Validate and return the levels that a task's discrete actions select, shape (k,)."""
     if len(commands) > 1:
         raise ValueError(
             f"action = {name!r}: {task.name} has several motors and discrete actions: use 'force'"
@@ -225,9 +225,9 @@ def _discrete_levels(
 class ControlCommands:
     """Conversion from actions to the controls of any model, with units, limits and disturbances.
 
-    Actions of actuators without our motors pass unchanged. Disturbances are computed once per
-    environment step, not per integration step. They change the force [N or N*m] of a plain motor
-    before the gear, and the control of other actuators.
+    Actions for actuators without our motors pass unchanged. Disturbances are computed once per
+    environment step, not per integration step. If the model's actuator is a `<motor>` of MJCF, they
+    change its force [N or N*m] before the gear; otherwise they change its control.
     """
 
     def __init__(
@@ -317,7 +317,7 @@ class ControlCommands:
             )
             if gain is None:
                 raise ValueError(
-                    f"{name}: is not a plain motor, whose force is its control times a gain: use"
+                    f"{name}: is not a <motor>, whose force is its control times a gain: use"
                     " action='force', the environment's own actions"
                 )
             torque, limit = command.torque_per_unit, command.limit
@@ -354,7 +354,7 @@ class ControlCommands:
         return {"disturbances": self._disturber.memory} if self._disturber.enabled else {}
 
     def begin(self, key: float) -> None:
-        """Reset at the start of an episode with this random key."""
+        """Reset the disturbances at the start of an episode, with its random key."""
         if self._disturber.enabled:
             self._disturber.reset(np.zeros(1, dtype=int), key, self._holding_commands())
             self._data.qfrc_applied[self._dofs] = 0.0
@@ -382,16 +382,16 @@ class ControlCommands:
             action = np.asarray(action, dtype=np.float64) * self._scales
         if not self._disturber.enabled:
             return action
-        delayed_action = np.array(action, dtype=np.float64)
-        commanded_forces = delayed_action[self._controls] * self._gains
+        disturbed_action = np.array(action, dtype=np.float64)
+        commanded_forces = disturbed_action[self._controls] * self._gains
         commands, loads = (
             array[0] for array in self._disturber.disturb_commands(commanded_forces[np.newaxis])
         )
-        delayed_action[self._controls] = commands / self._gains
+        disturbed_action[self._controls] = commands / self._gains
         if self._pulses:
             self._data.qfrc_applied[self._dofs] = 0.0
             np.add.at(self._data.qfrc_applied, self._dofs, loads[self._loaded])
-        return delayed_action
+        return disturbed_action
 
 
 def _dof(model: mujoco.MjModel, index: int) -> int:
@@ -408,9 +408,10 @@ def _dof(model: mujoco.MjModel, index: int) -> int:
 def _holding_control(
     model: mujoco.MjModel, index: int, actuator: ActuatorModel
 ) -> tuple[float, float]:
-    """Return slope and offset, as a function of length, of the control that holds an actuator.
+    """Return slope and offset of the control that holds an actuator in place.
 
-    Both are 0 if the control is a force.
+    The control is slope*length + offset, with the actuator's length. Both are 0 if the control is a
+    force.
     """
     if actuator.MOTION:
         command = next(iter(actuator.commands().values()))

@@ -19,8 +19,8 @@
             parts.observation, parts.pointers)
 
 The loop computes the same as `env.unwrapped` would, bit for bit, and leaves the environment in its
-last state. The time limit is a wrapper's: the loop must apply it. The environment must stay alive
-during the calls.
+last state. The loop must apply the time limit itself, because Gymnasium applies it in a wrapper.
+The environment must not be deleted during the calls.
 """
 
 import functools
@@ -68,7 +68,7 @@ class VectorStep(NamedTuple):
 
 
 class Kernels(NamedTuple):
-    """Compiled functions; `pointers` is the argument of `codrl_mj.physics.stepping`."""
+    """Compiled functions; `pointers` is explained in `codrl_mj.physics.stepping`."""
 
     step: Compiled
     """(force, pointers) -> (reward, terminated, is_finite): one environment step.
@@ -78,7 +78,7 @@ class Kernels(NamedTuple):
     actuators' signals are in the trace.
     """
     reset: Compiled
-    """(generator, low, high, pointers) -> nothing: start of an episode.
+    """(generator, low, high, pointers) -> None: start an episode.
 
     The initial state is drawn by the numpy `Generator` between `low` and `high` (see
     `Task.bounds`); the observation is filled.
@@ -86,7 +86,7 @@ class Kernels(NamedTuple):
     step_rows: Compiled
     """`step` for all rows, by several threads; the arguments are (rows, `VectorStep`)."""
     observe_rows: Compiled
-    """(indices (m,), lane, rows, observations (N, k)) -> nothing: observe rows after a reset."""
+    """(indices (m,), lane, rows, observations (N, k)) -> None: observe rows after a reset."""
 
 
 class CompiledEnv(NamedTuple):
@@ -114,13 +114,14 @@ def compiled_env(env: Any) -> CompiledEnv | None:
     """Return an environment's compiled parts.
 
     Returns:
-        None if a part of the environment runs in Python: a physics without compiled steps, such as
-        the analytic one, or the randomization of actuators and models at resets.
+        The parts; None if the environment runs Python code, which is the case for a physics without
+        compiled steps, such as the analytic one, and with randomization at resets.
     """
     setup, physics = env.setup, env.physics
     if physics.stepping is None or setup.randomization.distributions:
         return None
     kernels, task = compiled_kernels(setup, physics), setup.task
+    # This raises a readable error if numba cannot compile the task's function.
     compiled_function(task.initial_state, task.state_names, "Task.state_names", types.float64[::1])
     low, high = setup.initial_bounds
     parts = kernels.step, kernels.reset, *bind_observation(setup, physics), physics.trace[-1]
@@ -216,15 +217,15 @@ def _kernels(
         entries = to_floats(initial_entries(draws))
         for entry in range(size):
             state[entry] = entries[entry]
-        # A number is drawn only if a key is needed: otherwise the next episodes would not start in
-        # the states in which Gymnasium's environment starts them with the same seed.
+        # The key is drawn only if it is needed. Each draw advances the generator, and Gymnasium's
+        # environment draws no key: later episodes would start in other states than its episodes.
         key = generator.random() * MAX_KEY if f64(i64(pointers)[OPTIONS])[NEEDS_KEY] != 0.0 else 0.0
         start(state, key, pointers)
         observe_row(np.zeros(simulation_at(pointers)[4].shape[1:]), state, pointers)
 
     @internal
     def step_range(first: int, end: int, lane: Any, rows: Any, steps: Any) -> int:
-        # The batch passes plain tuples; they become named tuples again to be readable.
+        # The batch passes plain tuples. They are converted to named tuples for readability.
         steps, lane, rows, num_diverged = VectorStep(*steps), Lane(*lane), Rows(*rows), 0
         stepping, observations, signals, elapsed = (
             steps.stepping,

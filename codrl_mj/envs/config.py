@@ -35,13 +35,13 @@ class EnvConfig:
     env source.
     """
     actuator: Any = "default"
-    """Actuator that transmits the force. A name (`default`: the task's default, which is the
-    paper's actuator if there is one; `ideal`, `paper`, `weak`, `weaker`, `open_loop`; or the name
-    of a family or a motor), an `ActuatorModel`, a mapping of its fields (`name` selects the
-    actuator that they modify), a file with such a mapping, `module:NAME`, or None (ideal). All
-    motors get the same actuator, or a mapping of name patterns to actuators assigns them; for a
-    task also a list with one for each motor. Stored as an `ActuatorModel`, as a tuple for a task
-    with several motors, or as a mapping of patterns for a third-party environment.
+    """Motor that delivers the force. A name (`default`: the task's default, which is the paper's
+    actuator if there is one; `ideal`, `paper`, `weak`, `weaker`, `open_loop`; or the name of a
+    family or a motor), an `ActuatorModel`, a mapping of its fields (`name` selects the actuator
+    that they modify), a file with such a mapping, `module:NAME`, or None (ideal). One actuator
+    applies to all motors. A mapping from patterns of motor names to actuators, or for a task a list
+    with one actuator for each motor, assigns different ones. Stored as an `ActuatorModel`, as a
+    tuple for a task with several motors, or as a mapping of patterns for a third-party environment.
     """
     physics: str = "mujoco"
     """`mujoco`; `analytic` (Gymnasium's equations; Furuta: a closed form); or a registered name."""
@@ -103,7 +103,8 @@ class EnvConfig:
         for field in dataclasses.fields(self):
             if field.name not in source.fields and values[field.name] != field.default:
                 raise ValueError(
-                    f"{field.name} = {values[field.name]!r}: {source.name} has none: leave it out"
+                    f"{field.name} = {values[field.name]!r}: {source.name} has no such field: leave"
+                    " it out"
                 )
         values["actuator"] = source.actuators(values["actuator"])
         if isinstance(values["levels"], list | tuple):
@@ -132,8 +133,8 @@ class EnvConfig:
         Args:
             task: name of the task or env source.
             actuator: value of the field of this name.
-            arguments: other fields and the options, each by its name or as `options`; no time
-                limit, which the caller handles.
+            arguments: other fields, and options, by name or in the mapping `options`. The time
+                limit must not be among them: the caller applies it.
 
         Raises:
             UnknownOptionError: a name is neither a field nor an option.
@@ -190,7 +191,7 @@ class EnvConfig:
 
     @property
     def distributions(self) -> dict[str, Distribution]:
-        """Path -> distribution of the fields that are drawn at every reset, in this order."""
+        """Path -> distribution of the fields to draw at every reset, in the order of drawing."""
         return parse_randomize(self.randomize)
 
     @property
@@ -268,7 +269,7 @@ class EnvConfig:
                 for field in dataclasses.fields(self)
                 if field.name not in omitted
             },
-            "actuator": _described(self.actuator),
+            "actuator": _to_json_values(self.actuator),
             "disturbances": dataclasses.asdict(self.disturbances),
             "joint": dataclasses.asdict(self.joint),
             "options": self.source.changed(self.options),
@@ -318,8 +319,8 @@ class EnvConfig:
         return dataclasses.replace(base, **fields)
 
 
-def _described(actuator: Any) -> Any:
-    """Return actuators in JSON's types."""
+def _to_json_values(actuator: Any) -> Any:
+    """Convert the field `actuator` to values that JSON can hold."""
     if isinstance(actuator, Mapping):
         return {pattern: mapping_of(each_actuator) for pattern, each_actuator in actuator.items()}
     return (

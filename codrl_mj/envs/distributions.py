@@ -1,6 +1,7 @@
-"""Distributions of randomized fields: a mapping of paths to distributions, in the order of drawing.
+"""Distributions of randomized fields, and parsing of the argument `randomize`.
 
-A path is `[PATTERN:]FIELD` for actuators (all of them if there is no pattern) or `model.FIELD`. A
+The argument becomes a mapping from paths to distributions, in the order in which they are drawn. A
+path is `[PATTERN:]FIELD` for actuators (all of them if there is no pattern) or `model.FIELD`. A
 distribution is a pure function of draws in [0, 1): the same draw always gives the same value.
 `str` returns a distribution as text that `parse` reads: `uniform(0.05, 0.2)`, `loguniform(0.1,
 10.0)`, `choice(1, 2)`.
@@ -127,10 +128,10 @@ class Choice:
             value.item() if isinstance(value, np.generic) else value for value in values
         )
         # Integers stay integers, because fields may be counts; a float would be refused there.
-        numbers_as_floats = (
+        converted_values = (
             number if isinstance(number, bool | int) else float(number) for number in python_values
         )
-        object.__setattr__(self, "values", tuple(numbers_as_floats))
+        object.__setattr__(self, "values", tuple(converted_values))
 
     def __str__(self) -> str:
         """Return the distribution as text that `parse` reads."""

@@ -26,7 +26,7 @@ from codrl_mj.envs.randomization import (
 from codrl_mj.physics.base import divergence_error, make_info_reader
 from codrl_mj.physics.variation import without_motors, write_fields
 
-# MuJoCo's warnings of speeds, accelerations and controls follow that of positions in this order.
+# In MuJoCo's list of warnings, BADQPOS, BADQVEL, BADQACC and BADCTRL are neighbors in this order.
 _POSITION = int(mujoco.mjtWarning.mjWARN_BADQPOS)
 
 
@@ -64,7 +64,7 @@ class MotorSettings:
 
 
 class ActuatorBank:
-    """The motors in one simulation of a model that was built with them."""
+    """The motors of one simulation, whose model was built with `codrl_mj.add_motors`."""
 
     def __init__(
         self,
@@ -189,7 +189,7 @@ class ActuatorBank:
         return np.array(values)
 
     def check_finite(self, name: str, time: float) -> None:
-        """Raise if the engine warned of values that are not finite or too large since the reset.
+        """Raise if MuJoCo has warned since the reset that a value is not finite, or too large.
 
         MuJoCo itself would reset the simulation and continue.
         """
@@ -216,7 +216,7 @@ class ActuatorBank:
         )
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Return the state besides the simulation's: delayed commands, and drawn values."""
+        """Return the state that `MjData` does not hold: delayed commands and drawn values."""
         delayed_commands = {name: memory.copy() for name, memory in self._commands.memory.items()}
         return delayed_commands | self.randomization_state.snapshot()
 
@@ -228,7 +228,7 @@ class ActuatorBank:
 
 
 def motor_names(model: mujoco.MjModel, motors: Iterable[int]) -> tuple[str, ...]:
-    """Return the motors' names: of the actuator or its target, or the index if not unique."""
+    """Return the motors' names: of the actuator, or else its target; its index if not unique."""
     actuator_names = [names[0] if names else "" for names in matchable_names(model)]
     unique_names = [
         name if name and actuator_names.count(name) == 1 else str(index)

@@ -35,9 +35,9 @@ from codrl_mj.physics.variation import (
 )
 
 MAX_CORNERS = 32
-"""Maximum number of combinations of bounds to check: all of five fields, a sample of more."""
+"""Maximum number of combinations of bounds to check; if there are more, a sample is checked."""
 MAX_REDRAWS = 1000
-"""Number of consecutive draws with an unstable loop after which a reset raises."""
+"""Number of consecutive draws with an unstable current loop after which a reset fails."""
 Uniforms = Callable[[np.ndarray, int], np.ndarray]
 """(simulations (m,), count) -> the next `count` draws in [0, 1) of each, shape (m, count)."""
 
@@ -55,7 +55,7 @@ class Randomization:
         allow_unstable: bool,
         model_name: str,
     ) -> None:
-        """Check that motors and model have the fields, and allow the values, of the distributions.
+        """Check that motors and model have the distributions' fields, and allow their values.
 
         Args:
             distributions: path -> distribution, in the order of drawing.
@@ -75,7 +75,7 @@ class Randomization:
             _match_motors(distributions, model, motors, fixed, model_name),
             list(motors.values()),
         )
-        paths_of_arms, paths_of_additions = (
+        arm_paths, addition_paths = (
             [
                 path
                 for path, motor_indices in matched.items()
@@ -108,23 +108,21 @@ class Randomization:
             for motor_index in range(len(actuators))
         ]
         """For each motor: column of the drawn values -> name of the field."""
-        self.model_paths = (*model_only_paths, *paths_of_additions)
+        self.model_paths = (*model_only_paths, *addition_paths)
         """Paths that change the model itself, and not only parameters of its motors."""
         self.variation = (
-            Variation(
-                model, model_only_paths, list(motors), vary_additions=bool(paths_of_additions)
-            )
+            Variation(model, model_only_paths, list(motors), vary_additions=bool(addition_paths))
             if self.model_paths
             else None
         )
         """Effect of the drawn fields on the model; None if only motors' parameters change."""
-        self.changes_mounting = bool(paths_of_arms or paths_of_additions)
+        self.changes_mounting = bool(arm_paths or addition_paths)
         """True if motors' arms, or what they add to the model, depend on drawn values."""
         self.draws_actuator = any(self.columns)
         """True if a motor's field is drawn, so that each draw must be checked for stability."""
-        drawn_columns = zip(self.families, self.columns, strict=True)
+        family_columns = zip(self.families, self.columns, strict=True)
         self.may_need_key = any(
-            {*columns.values()} & {*family.RANDOM} for family, columns in drawn_columns
+            {*columns.values()} & {*family.RANDOM} for family, columns in family_columns
         )
         """True if drawn values may make motors need a random key."""
 
@@ -143,8 +141,8 @@ class RandomizationState:
     ) -> None:
         """Start without drawn values for simulations with these nominal motors.
 
-        `apply_values` writes the drawn values into some simulations (m,), before they are reset or
-        restored.
+        `apply_values` writes the drawn values into the simulations with given indices (m,). It is
+        called before they are reset or restored.
         """
         self.randomization, self._apply_values = randomization, apply_values
         self._motors = motors
@@ -160,7 +158,7 @@ class RandomizationState:
         """Draw new values for the only simulation."""
         self.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
 
-    def draw(self, random: Uniforms, rows: np.ndarray) -> None:
+    def draw(self, draw_uniforms: Uniforms, rows: np.ndarray) -> None:
         """Draw new values for the simulations `rows` (m,); they must be reset afterwards.
 
         A set of values with an unstable motor is drawn again as a whole.
@@ -174,7 +172,7 @@ class RandomizationState:
         )
         pending = np.arange(len(rows))
         while len(pending):
-            draws = random(rows[pending], len(randomization.distributions))
+            draws = draw_uniforms(rows[pending], len(randomization.distributions))
             for column, distribution in enumerate(randomization.distributions.values()):
                 # A contiguous copy, because numpy may round strided arrays differently: a draw must
                 # give the same value in any batch.
@@ -544,7 +542,8 @@ def _type_of_field(family: Family, path: str) -> type:
 def _depends_on(quantity: Callable[[ActuatorModel], Any], motor: ActuatorModel, path: str) -> bool:
     """Return True if a quantity of a motor depends on a field.
 
-    A product with a factor of 0 hides the dependence, so it is also tried with all fields at 2.
+    A factor of 0 in a product would hide the dependence, so the test is repeated with all fields
+    at 2.
     """
     family: Family = type(motor)
     fields, field = field_paths(family), split_pattern(path)[1]

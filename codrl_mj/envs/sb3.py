@@ -28,7 +28,8 @@ class ActuatedVecEnv(VecEnv):
         """Wrap a vector environment in `SAME_STEP` mode.
 
         Raises:
-            ValueError: the agents' networks cannot use its observations or actions; it is closed.
+            ValueError: the agents cannot use its observations, actions or autoreset mode. The
+                environment is closed first.
         """
         observation_space, action_space, problem = (
             env.single_observation_space,
@@ -37,9 +38,9 @@ class ActuatedVecEnv(VecEnv):
         )
         if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
             problem = (
-                f"observations are {observation_space}: must be a vector, which the agents'"
-                " networks take: flatten them with a wrapper of Gymnasium's (FlattenObservation),"
-                " and register that environment"
+                f"observations are {observation_space}: must be a vector, because the"
+                " agents' networks need one: flatten them with Gymnasium's FlattenObservation, and"
+                " register that environment"
             )
         elif (
             not isinstance(action_space, spaces.Box | spaces.Discrete)
@@ -67,7 +68,7 @@ class ActuatedVecEnv(VecEnv):
         super().__init__(env.num_envs, observation_space, action_space)
 
     def reset(self) -> np.ndarray:
-        """Start an episode in every environment, with the seeds and options set before."""
+        """Start an episode in every environment, with the seeds and options that were set."""
         options = self._options[0]
         if any(environment_options != options for environment_options in self._options):
             raise ValueError(
@@ -132,7 +133,7 @@ class ActuatedVecEnv(VecEnv):
     def conclude(
         self, observation: np.ndarray, total: float, length: int, truncated: bool, signals: Signals
     ) -> tuple[np.ndarray, list[dict[str, Any]]]:
-        """Record an episode that compiled code ran in the only environment, and reset it.
+        """Record an episode that compiled code ran in a single environment, and reset it.
 
         Args:
             observation: its last observation, shape (k,).
@@ -146,8 +147,7 @@ class ActuatedVecEnv(VecEnv):
         """
         if self.num_envs != 1:
             raise ValueError(
-                f"num_envs = {self.num_envs}: an episode can only be concluded if it is the only"
-                " one"
+                f"num_envs = {self.num_envs}: must be 1 if compiled code runs whole episodes"
             )
         self._returns[0], self._lengths[0] = total, length
         outcome = self._outcome(0, observation, truncated)
@@ -184,7 +184,7 @@ class ActuatedVecEnv(VecEnv):
 
     def _records(self) -> dict[str, np.ndarray]:
         """Return the entries of a snapshot that this class adds to the environments'."""
-        # Arrays have no None: a seed of -1 is one that was not set.
+        # An array of integers cannot hold None: -1 marks a seed that was not set.
         seeds = np.array([-1 if seed is None else seed for seed in self._seeds], dtype=np.int64)
         return {"returns": self._returns.copy(), "lengths": self._lengths.copy(), "seeds": seeds}
 

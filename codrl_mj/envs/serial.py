@@ -1,4 +1,4 @@
-"""A `VectorEnv` that steps single environments one by one, if they cannot be batched."""
+"""A `VectorEnv` that steps environments one by one, for those that cannot be batched."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -41,8 +41,8 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
 
         Args:
             num_envs: number of environments, >= 1.
-            task: the task's name; or a function that makes an environment with its actuators, which
-                must be picklable if processes are used.
+            task: the task's name; or a function that makes an environment with its actuators;
+                the function must be picklable if the vector is sent to another process.
             actuator: as for `ActuatedEnv`; or a sequence with one actuator for each environment.
             max_episode_steps: time limit of each environment [steps]; None for none.
             autoreset_mode: reset of an environment after its episode, as for `ActuatedVectorEnv`.
@@ -55,6 +55,8 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
                 message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
+        # The last argument is the memory of one environment [bytes], which is larger if a function
+        # makes it.
         check_counts(num_envs, max_episode_steps, 20_000 if isinstance(task, str) else 200_000)
         if num_threads not in (0, 1):
             raise ValueError(
@@ -93,7 +95,8 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
     def randomization(self) -> dict[str, Array]:
         """Drawn values of the present episodes: path -> array (N,), and the number `rejected`.
 
-        A field that is drawn for some motors has the path PATTERN:FIELD. Empty without draws.
+        A field that is drawn for some motors has the path PATTERN:FIELD. The mapping is empty if
+        nothing is randomized.
         """
         values_of_envs = []
         for env_values in self.get_attr("randomization"):
@@ -117,7 +120,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         }
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Advance every environment by one step; one whose episode ends is reset at once."""
+        """Advance every environment by one step, or reset it, as `autoreset_mode` says."""
         observations, rewards, terminated, truncated, infos = super().step(actions)
         ended = terminated | truncated
         # The last infos of episodes that ended are in `final_info`, those of other episodes in the

@@ -248,7 +248,7 @@ def is_per_environment(actuator: Any, task: str) -> bool:
 def set_up_many(
     num_envs: int, task: str, actuator: Any, arguments: Mapping[str, Any]
 ) -> tuple[ResolvedEnv, list[tuple[ActuatorModel, ...]]]:
-    """Return the configuration that many environments share, and the actuators of each of them."""
+    """Return the configuration that the environments share, and the actuators of each one."""
     if not is_per_environment(actuator, task):
         setup = ResolvedEnv.build(EnvConfig.from_arguments(task, actuator, arguments))
         return setup, [setup.commands.simulated] * num_envs

@@ -62,7 +62,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             physics: `mujoco`, `analytic` (Gymnasium's equations, or a closed form), or a registered
                 name.
             render_mode: None; `rgb_array`: `render` returns images; `human`: pygame shows every
-                step in a window. `render` refuses other modes, about which `gymnasium.make` warns.
+                step in a window. `gymnasium.make` warns of other modes, and `render` refuses them.
             width: width of rendered images [px].
             height: height of rendered images [px].
             camera: a camera of the model: `fixed` or `close`.
@@ -132,7 +132,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     @property
     def state(self) -> np.ndarray:
-        """Mechanical state, shape (n,), float64, as in Gymnasium; setting it keeps the motor."""
+        """Mechanical state, shape (n,), float64, as in Gymnasium; setting keeps the motor's state."""
         return self.physics.state.copy()
 
     @state.setter
@@ -319,7 +319,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         return None
 
     def _scene(self) -> Any:
-        """Return the physics to render; the task's ideal model if this physics has none."""
+        """Return the physics to render; if it has no scene, a simulation with ideal actuators."""
         if self.physics.scene is not None:
             return self.physics
         if self._fallback_scene is None:

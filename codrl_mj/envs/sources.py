@@ -47,8 +47,9 @@ _UNITS = (
 class EnvSource(abc.ABC):
     """Source of environments; a subclass defines `name` and `make`, and may override the rest.
 
-    `make` returns a Gymnasium environment whose motors can be read. `codrl_mj.make` creates one
-    from any function that returns an environment with MuJoCo's `model` and `data`.
+    `make` returns a Gymnasium environment with motors that the package can record. To create one,
+    call `codrl_mj.make` with a function that returns an environment with MuJoCo's `model` and
+    `data`.
     """
 
     name: str
@@ -70,7 +71,7 @@ class EnvSource(abc.ABC):
     env_id: str = ""
     """Gymnasium id, if `gymnasium.make` accepts the fields of an `EnvConfig` for it."""
     option_names: tuple[str, ...] = ()
-    """Names of declared options; empty if the options are those of its environments."""
+    """Names of its options; empty if its environments take any keyword arguments."""
 
     @abc.abstractmethod
     def make(self, config: Any, **view: Any) -> Any:
@@ -126,7 +127,7 @@ class EnvSource(abc.ABC):
         return {type(self).__module__, *files}
 
     def options(self, options: Any) -> Any:
-        """Return options as the configuration stores them: keyword arguments that JSON can hold.
+        """Return options as the configuration stores them: as a mapping that JSON can hold.
 
         Raises:
             ValueError: the options are not such a mapping.
@@ -234,7 +235,7 @@ class EnvSource(abc.ABC):
         return _original_action_space(self, json.dumps(self.changed(config.options)))
 
     def default_agent(self, config: Any) -> str:
-        """Return the name of the agent that is trained unless another is named."""
+        """Return the name of the agent that is trained by default."""
         return "sac" if isinstance(self.action_space(config), spaces.Box) else "ppo"
 
     def view(
@@ -244,7 +245,7 @@ class EnvSource(abc.ABC):
         height: int,  # noqa: ARG002
         camera: str | None,
     ) -> dict[str, Any] | None:
-        """Return arguments for `make` that set the image size [px]; None to render recorded states.
+        """Return arguments of `make` for rendering; None if recorded states are rendered instead.
 
         Raises:
             ValueError: it has no such camera, or no choice of cameras.
@@ -256,7 +257,11 @@ class EnvSource(abc.ABC):
         return {"render_mode": "rgb_array"}
 
     def scene(self, config: Any) -> tuple[Any, Any, str | None]:
-        """Return a model for rendering states, a function (state -> `MjData`) or None, a camera."""
+        """Return the objects for rendering recorded states.
+
+        Returns:
+            The model; a function (state) -> `MjData`, or None; and a camera's name, or None.
+        """
         with contextlib.closing(config.make()) as env:
             return env.unwrapped.model, None, None
 
@@ -347,8 +352,8 @@ def actuators_by_pattern(actuator: Any, default: str = "ideal") -> Mapping[str, 
     """Return pattern -> actuator, from a user's value of `actuator`."""
     if actuator in ({}, []) or isinstance(actuator, list | tuple):
         raise ValueError(
-            f"actuator = {actuator!r}: must be one for all motors, or a mapping of patterns to"
-            " actuators, such as {'.*': 'lag'}"
+            f"actuator = {actuator!r}: must be one actuator for all motors, or a mapping of patterns"
+            " to actuators, such as {'.*': 'lag'}"
         )
     return pattern_mapping(actuator) or {ALL_MOTORS: default if actuator == "default" else actuator}
 
@@ -376,9 +381,10 @@ def pattern_mapping(actuator: Any) -> Mapping[str, Any] | None:
 
 
 def is_source_name(name: str) -> bool:
-    """Return True if a text may name a source, as every `module:NAME` may.
+    """Return True if a text has the form of a source's name, such as any `module:NAME`.
 
-    The path of a folder does not, even if it looks like a Gymnasium id (`runs/swing-v2`).
+    The path of an existing folder does not count, even if it looks like a Gymnasium id
+    (`runs/swing-v2`).
     """
     if name in TASKS or re.fullmatch(r"[\w.]+:[\w.]+", name) is not None:
         return True

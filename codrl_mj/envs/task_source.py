@@ -27,7 +27,7 @@ from codrl_mj.user_code import asset_path
 
 
 class UnknownOptionError(ValueError, TypeError):
-    """Unknown keyword of an environment; also a TypeError, as in Python and as TorchRL expects."""
+    """Unknown option of an environment; also the TypeError that Python and TorchRL expect."""
 
 
 class TaskEnvSource(EnvSource):
@@ -149,7 +149,7 @@ class TaskEnvSource(EnvSource):
 
     def _by_pattern(self, patterns: Mapping[str, Any]) -> dict[str, Any]:
         """Return motor -> actuator, from a mapping of patterns of motor names to actuators."""
-        # The import is local because it imports numba, which takes long.
+        # A local import, because the module imports numba, which takes long.
         from codrl_mj.engine.specs import match_pattern, split_pattern
 
         names, actuators_by_motor = [[motor] for motor in self.task.motors], {}
@@ -272,7 +272,10 @@ class TaskEnvSource(EnvSource):
         ]
 
     def at_goal(self, episode: Any) -> np.ndarray | None:
-        """Return True for states at the goal; without a goal, for all unless it terminated."""
+        """Return a bool array, True for states at the goal.
+
+        A task without a goal is at its goal in all states, unless the episode terminated.
+        """
         if self.task.goal is None:
             return np.full(len(episode.state), not episode.terminated)
         return np.asarray(self.task.goal(episode.state.T), dtype=bool)

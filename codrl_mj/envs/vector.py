@@ -127,7 +127,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._ended = np.zeros(self.num_envs, dtype=bool)
         self._observations: Array = np.zeros(self.observation_space.shape or (), dtype=np.float32)
-        # Signals of the last step, each an array of shape (N,).
+        # Signals of the last step, each an array of shape (N,) or (N, motors).
         self.signals: Signals | None = None
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         if render_mode is not None:
@@ -145,7 +145,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
 
     @property
     def state(self) -> Array:
-        """Mechanical states, shape (N, n), float64, as in Gymnasium; setting keeps the motors."""
+        """Mechanical states, (N, n), float64, as in Gymnasium; setting keeps the motors' states."""
         return self.physics.state
 
     @state.setter

@@ -57,7 +57,7 @@ class Nameless(EnvSource):
     [
         (
             lambda: EnvConfig(NAME, integrator="rk4"),
-            "integrator = 'rk4': rig has none: leave it out",
+            "integrator = 'rk4': rig has no such field: leave it out",
         ),
         (lambda: EnvConfig("tests.envs.rig:rk4_of_nobody"), "rk4_of_nobody"),
         (
