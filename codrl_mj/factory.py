@@ -28,7 +28,7 @@ def make(
         env: a task's name or id, such as `pendulum`; the id of a third-party environment;
             `module:NAME` of a custom task or env source; an `EnvConfig`; or a function or class
             that makes an environment, which needs no id.
-        actuator: motor that delivers the forces: a name, an `ActuatorModel`, or a mapping from
+        actuator: actuator that delivers the forces: a name, an `ActuatorModel`, or a mapping from
             patterns of motor names to these. None selects the default motor of a task, and no motor
             in other environments. With `"ideal"`, an environment behaves, bit for bit, as it does
             without motors.

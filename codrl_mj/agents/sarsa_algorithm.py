@@ -314,7 +314,7 @@ class CompiledEpisodes:
             self._physics.check_finite()
         columns = self._record[:length].T.copy()
         signals = setup.signals(columns, columns[0])
-        observations, infos = self.env.conclude(
+        observations, infos = self.env.finish_episode(
             self._observation.copy(), total, length, not terminated, signals
         )
         return (

@@ -1,4 +1,4 @@
-"""Raw mjModel and mjData memory for compiled code: layouts, families, backends, readout."""
+"""Our actuators inside MuJoCo: memory layouts, compiled families, backends and readout."""
 
 from codrl_mj.engine.control import CallbackInUseError, install, installed, uninstall
 from codrl_mj.engine.families import load_family

@@ -1,9 +1,8 @@
 """The callback backend: MuJoCo's control and bias callbacks that run our actuators in our tasks.
 
-numba compiles them to C functions. They are pure functions of (mjModel, mjData): they recognize our
-actuators and read their parameters from the model's user data, and keep all state in `data.act`.
-The offsets of the structures' fields are compiled in, so they are part of the key under which
-compiled code is cached on disk.
+numba compiles them to C functions. They have no state of their own: they recognize our actuators
+and read their parameters in the model's user data, and keep all state in `data.act`. The offsets of
+the structures' fields are constants in the code, so they are part of its key in the cache on disk.
 """
 
 import ctypes

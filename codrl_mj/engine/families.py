@@ -72,14 +72,14 @@ the inertia; 1 if its command is a motion; and its `slot_size`.
 """
 _SIZES = np.zeros((10**6, 6), dtype=np.int32)
 """Sizes of the families, by family number."""
-_REFERENCES = np.zeros(10**6, dtype=np.uintp)
-"""Addresses of the families' `reference` as C strings, by family number."""
+_IMPORT_PATHS = np.zeros(10**6, dtype=np.uintp)
+"""Addresses of the families' import paths as C strings, by family number."""
 _COMPILED: dict[int, tuple[Family, Any]] = {}
 """Family number -> (family, owner of the memory that the tables point to)."""
 
 addresses_pointer = named_address("codrl_mj_families", _ADDRESSES.ctypes.data)
 sizes_pointer = named_address("codrl_mj_sizes", _SIZES.ctypes.data)
-references_pointer = named_address("codrl_mj_references", _REFERENCES.ctypes.data)
+import_paths_pointer = named_address("codrl_mj_import_paths", _IMPORT_PATHS.ctypes.data)
 
 _F64, _ADDRESS = types.float64, types.uintp
 _ADVANCE_TYPE = _F64(_ADDRESS, _F64, _ADDRESS, _ADDRESS, _ADDRESS, *(_F64,) * 6)
@@ -134,7 +134,7 @@ def load_family(family: Family) -> None:
     if family.INERTIA:
         load_inertia()
     function, text = _compile(family), ctypes.create_string_buffer(import_path(family).encode())
-    _SIZES[family_number], _REFERENCES[family_number] = (
+    _SIZES[family_number], _IMPORT_PATHS[family_number] = (
         (*sizes, slot_size(family)),
         ctypes.addressof(text),
     )
@@ -152,7 +152,7 @@ def family_sizes(family: Family) -> tuple[int, ...]:
 
 @contextlib.contextmanager
 def family_replaced(family: Family, replacement: Family) -> Iterator[None]:
-    """Replace a family's `advance` by another family's in a `with` block.
+    """Replace a family's compiled `advance` by another family's, in a `with` block.
 
     Both families must have the same states and signals.
     """
@@ -166,7 +166,7 @@ def family_replaced(family: Family, replacement: Family) -> Iterator[None]:
         _ADDRESSES[family_number] = original
 
 
-_FOREIGN_PACKAGES = sys.stdlib_module_names | {"numba", "numpy", "scipy"}
+_LIBRARIES = sys.stdlib_module_names | {"numba", "numpy", "scipy"}
 """Packages whose functions numba supports by itself, or not at all."""
 
 _REGISTERED: set[FunctionType] = set()
@@ -174,30 +174,25 @@ _REGISTERED: set[FunctionType] = set()
 
 
 def _register_callees(function: Any) -> None:
-    """Register all plain functions that a function calls, directly or not, with numba.
+    """Register the Python functions that a function calls, directly or indirectly, with numba.
 
-    The functions themselves stay plain Python.
+    They can still be called from Python.
     """
     # Nested functions and comprehensions have code objects of their own, among the constants.
     codes, names = [function.__code__], set[str]()
     for code in codes:
         names |= {*code.co_names, *code.co_freevars}
         codes += [const for const in code.co_consts if isinstance(const, CodeType)]
-    closed = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-    scope = function.__globals__ | {name: cell.cell_contents for name, cell in closed}
+    closure = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    scope = function.__globals__ | {name: cell.cell_contents for name, cell in closure}
     values = [scope[name] for name in names & scope.keys()]
-    # The list grows in this loop by functions that are called through a module, as in
-    # `module.f(x)`.
+    # The loop appends functions that are called through a module (`module.f(x)`) to the list.
     for value in values:
-        if (
-            isinstance(value, ModuleType)
-            and value.__name__.partition(".")[0] not in _FOREIGN_PACKAGES
-        ):
+        if isinstance(value, ModuleType) and value.__name__.partition(".")[0] not in _LIBRARIES:
             inner = [getattr(value, name) for name in names if hasattr(value, name)]
             values += [callee for callee in inner if all(callee is not known for known in values)]
         is_user_function = (
-            isinstance(value, FunctionType)
-            and value.__module__.partition(".")[0] not in _FOREIGN_PACKAGES
+            isinstance(value, FunctionType) and value.__module__.partition(".")[0] not in _LIBRARIES
         )
         if is_user_function and value not in _REGISTERED:
             _REGISTERED.add(value)
@@ -211,7 +206,7 @@ def compiled_function(
 ) -> Any:
     """Compile a user's function, and check that its result has the declared form.
 
-    The check needs the compiled function. It is skipped if the function passed it in an earlier
+    The check compiles the function. Both are skipped if the function passed the check in an earlier
     process.
     """
     compiled, marker = internal(function), VerifiedMarker("fits", function, form, argument_types)
@@ -344,9 +339,9 @@ def family_size(family_number: int, column: int) -> int:
 
 
 @internal(inline="always")
-def has_reference(family_number: int, text: int) -> bool:
-    """Return True if the C string at an address equals a family's `reference`."""
-    name, index = u64(references_pointer())[family_number], 0
+def has_import_path(family_number: int, text: int) -> bool:
+    """Return True if the C string at address `text` equals a family's import path."""
+    name, index = u64(import_paths_pointer())[family_number], 0
     while u8(name)[index] == u8(text)[index]:
         if u8(name)[index] == 0:
             return True

@@ -4,7 +4,7 @@ A slide joint with our signature in its user data is the horizontal position x o
 
     z(x) = height * sin(wavenumber * x)
 
-The callback does two things, both pure functions of (mjModel, mjData):
+The callback does two things, and has no state of its own:
 
 - it adds the hill's force, -mass * gravity * cos(wavenumber * x), to the joint's `qfrc_passive`;
 - it moves the body's geoms, in `data.geom_xpos` and `data.geom_xmat`, up to the hill and tilts
@@ -44,7 +44,6 @@ _FIRST, _SECOND = SIGNATURE
 @internal(inline="always")
 def _move_geoms(model: int, data: int, body: int, height: float, slope: float) -> None:
     """Move the body's geoms to `height` above its frame, tilted by `slope` about its y axis."""
-    # The tilt's axes in world coordinates: `along` the hill and `normal` to it.
     cosine = 1.0 / math.sqrt(1.0 + slope * slope)
     sine = slope * cosine
     origin = f64(entry_address(DATA.xpos(data), 3 * body))
@@ -62,6 +61,7 @@ def _move_geoms(model: int, data: int, body: int, height: float, slope: float) -
         position = f64(entry_address(DATA.geom_xpos(data), 3 * geom))
         matrix = f64(entry_address(DATA.geom_xmat(data), 9 * geom))
         for row in range(3):
+            # World coordinates of the body's axes, and of the axes along the hill and normal to it.
             ahead, left, up = frame[3 * row], frame[3 * row + 1], frame[3 * row + 2]
             along, normal = cosine * ahead + sine * up, cosine * up - sine * ahead
             position[row] = (

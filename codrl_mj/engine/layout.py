@@ -50,7 +50,7 @@ _SCALARS = {
 }
 """C type -> ctypes type; numba's table turns these into the types of compiled code.
 
-Sizes are signed, because numba makes floats of sums of signed and unsigned integers.
+Sizes are signed, because in numba the sum of a signed and an unsigned integer is a float.
 """
 
 
@@ -146,9 +146,9 @@ def _live_objects() -> dict[str, Any]:
 def check_field(struct_name: str, field: str) -> None:
     """Compare the layout of a field of `mjModel` or `mjData` with a live object.
 
-    An array must have the address, and any other field the value, that is read at the offset. A
-    field that the bindings do not expose (`pbase`), or that is empty, is checked through its
-    nearest neighbors on both sides.
+    The number at the field's offset must be the address of an array, or the value of any other
+    field. If the bindings do not expose the field (`pbase`), or it is empty, its nearest neighbors
+    on both sides are checked instead.
 
     Raises:
         LayoutError: the field differs.
@@ -188,12 +188,12 @@ def _is_exposed(owner: Any, field: str) -> bool:
 class StructFields(ModuleType):
     """Fields of a structure as functions of the structure's address, for compiled code.
 
-    The function of an array returns a typed pointer to its entries, that of any other field its
+    For an array, the function returns a typed pointer to the entries; for any other field, the
     value. The class is a module because numba resolves a module's attributes while it compiles.
     """
 
     def __init__(self, struct_name: str, within: str = "") -> None:
-        """Name the structure, `mjModel` or `mjData`, and a part of it with a final dot (`opt.`)."""
+        """Select `mjModel` or `mjData`, or a structure within it, with a final dot (`opt.`)."""
         super().__init__(f"{struct_name}.{within}".rstrip("."))
         self._owner, self._within = struct_name, within
 
@@ -236,7 +236,7 @@ MODEL, DATA = StructFields("mjModel"), StructFields("mjData")
 
 
 def addresses(data: mujoco.MjData) -> tuple[int, int]:
-    """Return the addresses of an `MjData`'s model and of the `MjData`, for compiled code."""
+    """Return the addresses of a simulation's `mjModel` and `mjData`, for compiled code."""
     return data.model._address, data._address
 
 

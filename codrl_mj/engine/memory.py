@@ -31,7 +31,9 @@ passes each entry of a tuple as an argument: a call with a drive's parameters wo
 
 
 def llvm_intrinsic(signature: Callable[..., Any]) -> Callable[[Any], Any]:
-    """Decorate a code generator (context, builder, signature, arguments) as a numba intrinsic.
+    """Return a decorator that makes a numba intrinsic of a code generator.
+
+    The generator is a function of (context, builder, signature, arguments).
 
     Args:
         signature: a function of the argument types that returns numba's signature.
@@ -75,9 +77,9 @@ f64, f32, i32, i64, u8, u64 = map(
 
 
 def named_address(name: str, address: int) -> Any:
-    """Return an intrinsic for an address, to which compiled code refers by a symbol's name.
+    """Return an intrinsic that returns an address, which the linker finds by a symbol's name.
 
-    Compiled code that is cached on disk then stays valid in processes with other addresses.
+    Compiled code that is cached on disk thus stays valid in processes with other addresses.
     """
     name = register_symbol(name, address)
 
@@ -200,7 +202,7 @@ def _as_floats(context: Any, builder: Any, signature: Any, arguments: Any) -> li
 
 def callback(function: Any, return_type: Any = None, *argument_types: Any) -> Any:
     """Wrap a compiled function (mjModel, mjData, ...) as a pointer for MuJoCo's setters."""
-    # The wrapper holds the function, whose machine code would be freed with it.
+    # The wrapper refers to the function, because the machine code is freed with the function.
     wrapper: Any = ctypes.CFUNCTYPE(return_type, ctypes.c_void_p, ctypes.c_void_p, *argument_types)(
         function.address
     )

@@ -1,4 +1,4 @@
-"""Compiled reads of a simulation that both backends share: user data, control and inertia.
+"""Compiled functions by which both backends read a simulation: user data, control and inertia.
 
 The inertia at an actuator's shaft comes from the engine's own factorization of the inertia matrix.
 """
@@ -69,8 +69,8 @@ def is_disabled(model: int, actuator: int) -> bool:
 def output_inertia(model: int, data: int, output: int, gear: float) -> float:
     """Return the inertia [kg*m^2] at an output through a gear; `load_inertia` must run first.
 
-    The computation is called through its address, so that only families that need the inertia spend
-    the second of its compilation.
+    The computation is called through its address. It takes a second to compile, and this way it is
+    compiled only for families that need the inertia.
     """
     return call(u64(_function_pointer())[0], model, data, output, gear)
 
@@ -78,8 +78,8 @@ def output_inertia(model: int, data: int, output: int, gear: float) -> float:
 @internal(inline="always")
 def _solve_inertia(model: int, data: int, output: int, gear: float, work: Any) -> float:
     """Return 1/(m*M^-1*m) for the moment m of an output; `work` (nv numbers) becomes L^-T*m."""
-    # M = L^T*D*L, hence m*M^-1*m is the sum of (L^-T*m)^2/D. The back substitution runs over the
-    # degrees of freedom that the moment reaches and their ancestors in the kinematic tree alone,
+    # M = L^T*D*L, hence m*M^-1*m is the sum of (L^-T*m)^2/D. The back substitution runs only over
+    # the degrees of freedom that the moment reaches, and their ancestors in the kinematic tree,
     # because all other entries stay zero.
     start, last = DATA.moment_rowadr(data)[output], 0
     entries = range(start, start + DATA.moment_rownnz(data)[output])
@@ -105,9 +105,9 @@ def _solve_inertia(model: int, data: int, output: int, gear: float, work: Any) -
 def load_inertia() -> Any:
     """Compile the function behind `output_inertia`, once per process, and return it.
 
-    The inertia is 1/(m*M^-1*m), with m = the gear times a row of `actuator_moment` and M =
-    L^T*D*L, the inertia matrix that `mj_fwdPosition` has factorized. It is the inertia that the
-    actuator feels with all other joints free, and infinite if the actuator moves nothing.
+    The inertia is 1/(m*M^-1*m). Here m is the gear times a row of `actuator_moment`, and M =
+    L^T*D*L is the inertia matrix that `mj_fwdPosition` has factorized. It is the inertia at the
+    actuator with all other joints free, and infinite if the actuator moves nothing.
     """
 
     @cfunc(

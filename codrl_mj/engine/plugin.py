@@ -29,7 +29,7 @@ from codrl_mj.engine.families import (
     advance_slot,
     commit_slot,
     family_size,
-    has_reference,
+    has_import_path,
     is_compiled,
     load_family,
     loaded_families,
@@ -41,7 +41,7 @@ from codrl_mj.engine.model_access import clip, command, is_disabled, output_iner
 from codrl_mj.plugin import FAMILY, NAME, library, log_warning, registered_plugins
 
 PLUGIN_HEADER_SIZE = USER_HEADER_SIZE + 1
-"""Length of the `user` data's header in this backend: `user_header` and the actuator's arm [m]."""
+"""Length of the header of `user` data in this backend: `user_header`, and the arm [m]."""
 EXTRA_STATES = 2
 """Number of states after the actuator's slot.
 
@@ -169,7 +169,7 @@ def _find_fault(model: int, instance: int) -> int:
         if not is_compiled(user[2]):
             return 2
         family_number = int(user[2])
-        if not has_reference(
+        if not has_import_path(
             family_number, _get_config_compiled(model, instance, _attribute_pointer())
         ):
             return 3
@@ -215,7 +215,7 @@ def compiled_entries() -> dict[str, Any]:
             if not is_held:
                 length = DATA.actuator_length(data)[out]
                 velocity = DATA.actuator_velocity(data)[out]
-                # The time of the committed state is set too, in case the user has changed the time.
+                # The user may have changed the time since the state was committed.
                 states[0] = time
                 is_motion, force = family_size(family_number, MOTION) != 0, 0.0
                 if is_motion:
@@ -259,7 +259,7 @@ def compiled_entries() -> dict[str, Any]:
             f64(state)[entry] = 0.0
 
     init_instance = external_function(
-        "codrl_mj_judge", _INIT_INSTANCE, types.int32(types.uintp, types.int32)
+        "codrl_mj_init_instance", _INIT_INSTANCE, types.int32(types.uintp, types.int32)
     )
 
     @cfunc(types.int32(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")

@@ -43,17 +43,17 @@ def motors(model: mujoco.MjModel) -> dict[int, ActuatorModel]:
         Index of the model's actuator -> our actuator, in ascending order.
 
     Raises:
-        ValueError: an actuator has our signature but not our layout, or a parameter out of bounds;
-            or it has our signature without our plugin, or our plugin without the signature; or its
-            family is not known in this process; or, in the callback backend, it has a delay, which
-            the callback does not see, a gain, which would add to the motor's torque, or limits of
-            its activations, which are the motor's state.
+        ValueError: an actuator has our signature but not our layout, or our plugin but not our
+            signature; or a parameter is out of bounds; or the family is not known in this process.
+            In the callback backend also: the actuator has a delay, which the callback does not see;
+            a gain, whose force would add to the motor's; or limits of its activations, which are
+            the motor's state.
     """
     actuators = {}
-    slot = registered_plugins()[NAME][0]
+    plugin_slot = registered_plugins()[NAME][0]
     for index in range(model.nactuator):
         user, instance = model.actuator_user[index], model.actuator_plugin[index]
-        has_plugin = instance >= 0 and model.plugin[instance] == slot
+        has_plugin = instance >= 0 and model.plugin[instance] == plugin_slot
         is_signed = len(user) >= USER_HEADER_SIZE and tuple(user[:2]) == SIGNATURE
         if not has_plugin and not is_signed:
             continue
@@ -64,7 +64,7 @@ def motors(model: mujoco.MjModel) -> dict[int, ActuatorModel]:
             # Its force is part of the command of another actuator's motor.
             continue
         try:
-            actuators[index] = _motor_at(model, index, slot)
+            actuators[index] = _motor_at(model, index, plugin_slot)
         except ValueError as error:
             raise ValueError(
                 f"{model.actuator(index).name or f'actuator {index}'}: {error}"
@@ -78,14 +78,14 @@ def actuators_sharing_motor(model: mujoco.MjModel, index: int) -> list[int]:
     return [index] if instance < 0 else np.flatnonzero(model.actuator_plugin == instance).tolist()
 
 
-def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:
-    """Return the motor of one of our actuators; `slot` is the number of our plugin."""
+def _motor_at(model: mujoco.MjModel, index: int, plugin_slot: int) -> ActuatorModel:
+    """Return the motor of one of our actuators; `plugin_slot` is our plugin's number in MuJoCo."""
     user, instance = model.actuator_user[index], model.actuator_plugin[index]
     uses_plugin = instance >= 0
-    if uses_plugin and model.plugin[instance] != slot:
+    if uses_plugin and model.plugin[instance] != plugin_slot:
         raise ValueError(
-            f"plugin slot = {model.plugin[instance]}: a motor of codrl_mj needs {slot}, the slot of"
-            " its plugin. The model was compiled in a process with other plugins: compile it in"
+            f"plugin slot = {model.plugin[instance]}: a motor of codrl_mj needs {plugin_slot}, the"
+            " slot of its plugin. The model was compiled in a process with other plugins: compile it in"
             " this process, from XML or a spec"
         )
     if uses_plugin and (len(user) < PLUGIN_HEADER_SIZE or tuple(user[:2]) != SIGNATURE):
@@ -112,7 +112,7 @@ def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:
             )
         if model.plugin_statenum[instance] != size + EXTRA_STATES:
             raise ValueError(REASONS[5])
-        head, arm = PLUGIN_HEADER_SIZE, user[USER_HEADER_SIZE]
+        header_size, arm = PLUGIN_HEADER_SIZE, user[USER_HEADER_SIZE]
     else:
         expected = {
             "dyntype": (model.actuator_dyntype[index], mujoco.mjtDyn.mjDYN_USER, 'dyntype="user"'),
@@ -139,12 +139,13 @@ def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:
             raise ValueError(
                 f"gear = {gear}: a motor of codrl_mj needs gear = 1/arm > 0 and no other entry"
             )
-        head, arm = USER_HEADER_SIZE, 1.0 / gear[0]
-    if len(user) < head + len(names):
+        header_size, arm = USER_HEADER_SIZE, 1.0 / gear[0]
+    if len(user) < header_size + len(names):
         raise ValueError(
-            f"user = {list(user)}: a {family.__name__} needs {head} numbers and {', '.join(names)}"
+            f"user = {list(user)}: a {family.__name__} needs {header_size} numbers and"
+            f" {', '.join(names)}"
         )
-    return family.from_parameter_values(user[head : head + len(names)], arm)
+    return family.from_parameter_values(user[header_size : header_size + len(names)], arm)
 
 
 def motor_slots(
@@ -217,7 +218,7 @@ def check_shafts(
     Args:
         model: a compiled model.
         allow_unstable: True to return instead of raising an error.
-        held: True if actuators are not given the inertia, and hold the speed over a step.
+        held: True if actuators are simulated without the inertia, at a constant speed over a step.
         actuators: actuators by index; the model's own if None.
         explicit: True if positions are integrated with the previous speeds (explicit Euler).
 
@@ -246,7 +247,7 @@ def check_shafts(
         arm = 1.0 if model.actuator_plugin[index] < 0 else actuator.arm_radius
         inertias.append(shaft_inertia(model, data, model.actuator_outadr[index], 1.0 / arm))
         try:
-            # Motors on the same shaft share its inertia, and each is checked without the others.
+            # Motors on the same shaft share its inertia equally; each is checked with its share.
             num_on_shaft = shafts.count(shaft)
             actuator.check_shaft(
                 model.opt.timestep, inertias[-1] / num_on_shaft, num_on_shaft > 1 or held
@@ -259,12 +260,12 @@ def check_shafts(
     largest = spectral_radius(step)
     if largest < MAX_STABLE_RADIUS or allow_unstable:
         return largest
-    separate_radii = {position: spectral_radius(step, position) for position in linear}
+    separate_radii = {number: spectral_radius(step, number) for number in linear}
     worst = max(separate_radii, key=separate_radii.__getitem__)
     coupled = separate_radii[worst] < MAX_STABLE_RADIUS
     remedy = list(loop_actuators.values())[worst].loop_remedy(inertias[worst])
     raise UnstableError(
-        f"{', '.join(names[position] for position in linear) if coupled else names[worst]}: the"
+        f"{', '.join(names[number] for number in linear) if coupled else names[worst]}: the"
         f" outer loops are unstable{' together' * coupled}: spectral radius {largest:.4g} over a"
         f" mechanical step of {step:g} s, must be < 1. {remedy}"
         f" {_shorter_step(loop_actuators.values(), spectral_radius, step)}; or pass"
@@ -280,10 +281,11 @@ def _loop_radius(
     held: bool,
     explicit: bool,
 ) -> tuple[Callable[..., float], list[int]]:
-    """Return a function for the spectral radius, and the positions of the linear actuators.
+    """Return a function for the spectral radius, and the numbers of the linear actuators.
 
-    The function takes a step [s] and the positions in `actuators` of those whose loops are closed;
-    without positions, the loops of all linear actuators are closed.
+    Actuators are numbered in the order of `actuators`. The function takes a step [s] and the
+    numbers of the actuators whose loops are closed; without numbers, the loops of all linear
+    actuators are closed.
     """
     joints, motors = _joints(model, data, actuators, explicit), list(actuators.values())
     advances = [motor.advance if held else compiled_advance(type(motor)) for motor in motors]
@@ -292,28 +294,28 @@ def _loop_radius(
         for motor, inertia in zip(motors, inertias, strict=True)
     ]
 
-    def linearized(position: int, timestep: float, size: float = 1.0) -> np.ndarray:
+    def linearized(number: int, timestep: float, size: float = 1.0) -> np.ndarray:
         change = size * stability.PERTURBATION
         return stability.linearize(
-            motors[position], advances[position], timestep, known_inertias[position], change
+            motors[number], advances[number], timestep, known_inertias[number], change
         )
 
-    def is_smooth(position: int) -> bool:
-        small, large = (linearized(position, model.opt.timestep, size) for size in (1.0, 10.0))
+    def is_smooth(number: int) -> bool:
+        small, large = (linearized(number, model.opt.timestep, size) for size in (1.0, 10.0))
         return np.allclose(small, large, rtol=0.01, atol=1e-6 * np.abs(small).max())
 
-    def spectral_radius(timestep: float, *positions: int) -> float:
-        chosen = list(positions or linear)
-        loops = [linearized(position, timestep) for position in chosen]
-        shafts = joints._replace(moments=joints.moments[chosen])
-        return stability.loop_radius(shafts, loops, timestep) if chosen else 0.0
+    def spectral_radius(timestep: float, *numbers: int) -> float:
+        closed = list(numbers or linear)
+        loops = [linearized(number, timestep) for number in closed]
+        shafts = joints._replace(moments=joints.moments[closed])
+        return stability.loop_radius(shafts, loops, timestep) if closed else 0.0
 
     # A custom family may have friction or backlash at rest, which a linearized loop cannot
     # describe.
     linear = [
-        position
-        for position, motor in enumerate(motors)
-        if type(motor) in BUILT_IN or is_smooth(position)
+        number
+        for number, motor in enumerate(motors)
+        if type(motor) in BUILT_IN or is_smooth(number)
     ]
     return spectral_radius, linear
 
@@ -328,7 +330,7 @@ Joints without any force have a radius of 1, and rounding may raise it.
 def _shorter_step(
     actuators: Collection[ActuatorModel], radius_at: Callable[[float], float], timestep: float
 ) -> str:
-    """Return a remedy: the longest of some shorter steps [s] at which the loops are stable."""
+    """Return a remedy: the longest of several shorter steps [s] that make the loops stable."""
     for parts in (2, 3, 4, 5, 8, 10, 16, 20, 32, 50, 100):
         try:
             for actuator in actuators:

@@ -59,11 +59,12 @@ def add_motors(
     allow_unstable: bool = False,
     joint_dynamics: str | None = None,
 ) -> mujoco.MjSpec:
-    """Add motors to the actuators of a model; they deliver these actuators' forces within limits.
+    """Add motors to the actuators of a model.
 
-    The model's actuators keep their gear, gain, bias, dynamics and ranges; the force that the
-    engine would have computed from them becomes the motor's desired force. The motor's inertia and
-    friction are added to the joint, through the gear.
+    A motor delivers the forces of its actuators within its limits. The model's actuators keep their
+    gear, gain, bias, dynamics and ranges; the force that the engine would have computed from them
+    becomes the motor's desired force. The motor's inertia and friction are added to the joint,
+    through the gear.
 
         >>> spec = mujoco.MjSpec.from_file("half_cheetah.xml")
         >>> model = codrl_mj.add_motors(spec, {"b.*": my_motor, "f.*": "ideal"}).compile()
@@ -78,7 +79,8 @@ def add_motors(
         allow_unstable: accept motors that are unstable at the model's step.
         joint_dynamics: treatment of the model's damping, armature and frictionloss at a motor's
             joint, tendon or actuator, if the motor has the same quantity. `keep` adds both;
-            `replace` removes the model's, because it describes the motor. None adds both and warns.
+            `replace` removes the model's value, which is right if it describes the motor. None adds
+            both and warns.
 
     Returns:
         A new spec, not compiled yet.
@@ -247,7 +249,7 @@ def _refusal_together(
     pattern: str,
     actuator: ActuatorModel,
 ) -> str:
-    """Return why a pattern's matches at one joint cannot share a motor; empty if they can."""
+    """Return why the actuators that a pattern matches at a joint cannot share a motor, or ""."""
     descriptions, is_joined = (
         [_describe(spec.actuators[index], index) for index in indices],
         len(split_pattern(pattern)) > 1,
@@ -266,14 +268,14 @@ def _refusal_together(
             " pattern for each"
         )
     rows, outputs = list(indices), model.actuator_outadr[list(indices)]
-    same = {"transmission": model.actuator_trntype[rows], "group": model.actuator_group[rows]}
-    same["gear"] = model.actuator_gear[outputs]
+    shared = {"transmission": model.actuator_trntype[rows], "group": model.actuator_group[rows]}
+    shared["gear"] = model.actuator_gear[outputs]
     if actuator.MOTION:
         return (
             f"{both}, but the command of a {type(actuator).__name__} is one motion, not the sum of"
             " several forces"
         )
-    for field in (name for name, values in same.items() if (values != values[0]).any()):
+    for field in (name for name, values in shared.items() if (values != values[0]).any()):
         return f"{both}, whose {field} differs: actuators that share a motor must have the same"
     if model.actuator_forcelimited[rows].all():
         return (
@@ -305,7 +307,7 @@ def _refusal(
         (transmission, _SHAFTS),
     ):
         if kind not in known:
-            return f"its force is not gain*input + bias over one shaft, but {kind.name}"
+            return f"its force must be gain*input + bias at one shaft, but it has {kind.name}"
     if model.actuator_ctrlnum[index] != 1 or model.actuator_outnum[index] != 1:
         return (
             f"it has {model.actuator_ctrlnum[index]} controls and {model.actuator_outnum[index]}"
@@ -429,7 +431,7 @@ So small a value is probably the bearing's, and counting it twice changes little
 
 
 def _added_dynamics(actuator: ActuatorModel, gear: float = 1.0) -> JointAdditions:
-    """Return a motor's additions to its joint through a gear; back-EMF counts as damping."""
+    """Return the motor's additions at its joint, beyond a gear; back-EMF counts as damping."""
     armature, damping, friction = actuator.additions
     return JointAdditions(
         gear**2 * armature, gear**2 * (damping + actuator.back_emf_damping), abs(gear) * friction
@@ -453,14 +455,14 @@ def _remove_dynamics(
 def describe_duplicate_dynamics(
     model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]
 ) -> list[str]:
-    """Describe damping, armature and friction of a model that a motor probably adds again.
+    """Describe the model's damping, armature and friction that a motor probably adds again.
 
     Args:
         model: the model without its motors' additions.
         motors: index of an actuator -> motor.
 
     Returns:
-        No text, or one for the warning.
+        A list with the text of the warning, or an empty list.
     """
     descriptions: dict[str, str] = {}
     for index, motor in motors.items():

@@ -226,8 +226,8 @@ class ControlCommands:
     """Conversion from actions to the controls of any model, with units, limits and disturbances.
 
     Actions for actuators without our motors pass unchanged. Disturbances are computed once per
-    environment step, not per integration step. If the model's actuator is a `<motor>` of MJCF, they
-    change its force [N or N*m] before the gear; otherwise they change its control.
+    environment step, not per integration step. If the model's actuator is a plain motor (force =
+    gain*control), they change its force [N or N*m] before the gear; otherwise its control.
     """
 
     def __init__(
@@ -317,7 +317,7 @@ class ControlCommands:
             )
             if gain is None:
                 raise ValueError(
-                    f"{name}: is not a <motor>, whose force is its control times a gain: use"
+                    f"{name}: is not a plain motor, whose force is its control times a gain: use"
                     " action='force', the environment's own actions"
                 )
             torque, limit = command.torque_per_unit, command.limit

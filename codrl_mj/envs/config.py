@@ -35,7 +35,7 @@ class EnvConfig:
     env source.
     """
     actuator: Any = "default"
-    """Motor that delivers the force. A name (`default`: the task's default, which is the paper's
+    """Actuator that delivers the force. A name (`default`: the task's default, which is the paper's
     actuator if there is one; `ideal`, `paper`, `weak`, `weaker`, `open_loop`; or the name of a
     family or a motor), an `ActuatorModel`, a mapping of its fields (`name` selects the actuator
     that they modify), a file with such a mapping, `module:NAME`, or None (ideal). One actuator
@@ -164,7 +164,7 @@ class EnvConfig:
             present_options = (
                 options_mapping(fields["options"])
                 if "options" in fields
-                else source.changed(self.options)
+                else source.non_default_options(self.options)
             )
             fields["options"] = {**present_options, **options}
         return dataclasses.replace(self, **fields), remaining
@@ -227,7 +227,7 @@ class EnvConfig:
             for name, value in arguments.items()
             if value is not None and value not in (NO_DISTURBANCES, UNMODIFIED_JOINT)
         }
-        return set_arguments | self.source.changed(self.options)
+        return set_arguments | self.source.non_default_options(self.options)
 
     def make(self, **view: Any) -> "gymnasium.Env[Any, Any]":
         """Build the environment.
@@ -256,7 +256,7 @@ class EnvConfig:
             if isinstance(arguments.get(name), list | tuple)
         }
         config, remaining = self.override(arguments)
-        return config.source.vector(config, num_envs, **actuators_per_env, **remaining)
+        return config.source.make_vec(config, num_envs, **actuators_per_env, **remaining)
 
     def as_mapping(self) -> dict[str, Any]:
         """Return the configuration as JSON-serializable values; `from_mapping` reads it."""
@@ -272,7 +272,7 @@ class EnvConfig:
             "actuator": _to_json_values(self.actuator),
             "disturbances": dataclasses.asdict(self.disturbances),
             "joint": dataclasses.asdict(self.joint),
-            "options": self.source.changed(self.options),
+            "options": self.source.non_default_options(self.options),
         }
 
     @classmethod

@@ -130,7 +130,7 @@ class ActuatedVecEnv(VecEnv):
             },
         }
 
-    def conclude(
+    def finish_episode(
         self, observation: np.ndarray, total: float, length: int, truncated: bool, signals: Signals
     ) -> tuple[np.ndarray, list[dict[str, Any]]]:
         """Record an episode that compiled code ran in a single environment, and reset it.

@@ -58,7 +58,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
         Args:
             task: the task's name, such as `cartpole`.
-            actuator: actuator that transmits the force, as for `EnvConfig.actuator`.
+            actuator: actuator that delivers the force, as for `EnvConfig.actuator`.
             physics: `mujoco`, `analytic` (Gymnasium's equations, or a closed form), or a registered
                 name.
             render_mode: None; `rgb_array`: `render` returns images; `human`: pygame shows every
@@ -132,7 +132,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     @property
     def state(self) -> np.ndarray:
-        """Mechanical state, shape (n,), float64, as in Gymnasium; setting keeps the motor's state."""
+        """Mechanical state, (n,), float64, as in Gymnasium; setting keeps the motor's state."""
         return self.physics.state.copy()
 
     @state.setter

@@ -85,7 +85,7 @@ class EnvSource(abc.ABC):
             ValueError: the configuration does not fit the model.
         """
 
-    def vector(self, config: Any, num_envs: int, **arguments: Any) -> Any:
+    def make_vec(self, config: Any, num_envs: int, **arguments: Any) -> Any:
         """Make a Gymnasium vector environment in `SAME_STEP` mode; by default stepped one by one.
 
         Args:
@@ -120,7 +120,7 @@ class EnvSource(abc.ABC):
     def code(self, options: Any) -> set[str | Path]:
         """Return names of modules and paths of files with its code; options may name files."""
         option_values = [
-            value for value in self.changed(options).values() if isinstance(value, str)
+            value for value in self.non_default_options(options).values() if isinstance(value, str)
         ]
         # `Path.is_file` would raise for a long text, which is not a file name.
         files = (Path(value).resolve() for value in option_values if os.path.isfile(value))  # noqa: PTH113
@@ -143,7 +143,7 @@ class EnvSource(abc.ABC):
             ) from None
         return json_options
 
-    def changed(self, options: Any) -> dict[str, Any]:
+    def non_default_options(self, options: Any) -> dict[str, Any]:
         """Return the options that differ from their defaults, by name."""
         return dict(options)
 
@@ -189,7 +189,7 @@ class EnvSource(abc.ABC):
         """Return pattern -> actuator from the result of `actuators`."""
         return dict(actuators)
 
-    def overlaid(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
+    def override_actuators(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
         """Return pattern -> actuator: `patterns`, and the configuration's for all other motors."""
         from codrl_mj.engine.reading import actuators_sharing_motor
         from codrl_mj.engine.specs import match_pattern, matchable_names
@@ -213,7 +213,7 @@ class EnvSource(abc.ABC):
         return {**remaining, **patterns}
 
     @property
-    def scripted(self) -> Any:
+    def scripted_task(self) -> Any:
         """The task whose scripted controller shows what its motor must do.
 
         Raises:
@@ -224,7 +224,7 @@ class EnvSource(abc.ABC):
             " and name the run"
         )
 
-    def as_with_motors(self, config: Any) -> Any:
+    def with_motor_steps(self, config: Any) -> Any:
         """Return a configuration with the time resolution that motors would need."""
         return config
 
@@ -232,7 +232,7 @@ class EnvSource(abc.ABC):
 
     def action_space(self, config: Any) -> "spaces.Space[Any]":
         """Return the action space without motors; other commands change its bounds or size."""
-        return _original_action_space(self, json.dumps(self.changed(config.options)))
+        return _original_action_space(self, json.dumps(self.non_default_options(config.options)))
 
     def default_agent(self, config: Any) -> str:
         """Return the name of the agent that is trained by default."""
@@ -352,8 +352,8 @@ def actuators_by_pattern(actuator: Any, default: str = "ideal") -> Mapping[str, 
     """Return pattern -> actuator, from a user's value of `actuator`."""
     if actuator in ({}, []) or isinstance(actuator, list | tuple):
         raise ValueError(
-            f"actuator = {actuator!r}: must be one actuator for all motors, or a mapping of patterns"
-            " to actuators, such as {'.*': 'lag'}"
+            f"actuator = {actuator!r}: must be one actuator for all motors, or a mapping of"
+            " patterns to actuators, such as {'.*': 'lag'}"
         )
     return pattern_mapping(actuator) or {ALL_MOTORS: default if actuator == "default" else actuator}
 

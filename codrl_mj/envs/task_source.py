@@ -50,7 +50,7 @@ class TaskEnvSource(EnvSource):
             self.env_id, disable_env_checker=True, **config.as_arguments(), **view
         )
 
-    def vector(self, config: Any, num_envs: int, **arguments: Any) -> Any:
+    def make_vec(self, config: Any, num_envs: int, **arguments: Any) -> Any:
         """Make a vector environment: a batch on MuJoCo, otherwise stepped one by one."""
         from codrl_mj.envs.serial import SerialVectorEnv
         from codrl_mj.envs.vector import ActuatedVectorEnv
@@ -80,7 +80,11 @@ class TaskEnvSource(EnvSource):
     def options(self, values: Any) -> Any:
         """Return the task's options as its `NamedTuple`."""
         option_type = self.task.options
-        options = self.changed(values) if isinstance(values, tuple) else options_mapping(values)
+        options = (
+            self.non_default_options(values)
+            if isinstance(values, tuple)
+            else options_mapping(values)
+        )
         for name, value in options.items():
             if name not in option_type._fields:
                 names = ", ".join(option_type._fields) or "none"
@@ -111,7 +115,7 @@ class TaskEnvSource(EnvSource):
             }
         )
 
-    def changed(self, options: Any) -> dict[str, Any]:
+    def non_default_options(self, options: Any) -> dict[str, Any]:
         """Return the options that differ from their defaults."""
         return {
             name: value
@@ -122,7 +126,7 @@ class TaskEnvSource(EnvSource):
     def option_flags(self, config: Any) -> list[tuple[str, Any, str, Any]]:
         """Return the flags of all tasks' options, so that messages can name another task's flag."""
         option_types: dict[str, Any] = {name: task.options for name, task in TASKS.items()}
-        changed_options = self.changed(config.options)
+        changed_options = self.non_default_options(config.options)
         return [
             (
                 option,
@@ -177,12 +181,12 @@ class TaskEnvSource(EnvSource):
             )
         )
 
-    def overlaid(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
+    def override_actuators(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
         """Return motor -> actuator: those of `patterns`, and the configuration's for the rest."""
         return {**config.actuators_by_name, **self._by_pattern(patterns)}
 
     @property
-    def scripted(self) -> Task:
+    def scripted_task(self) -> Task:
         """The task, if it has a scripted controller, which needs a single motor."""
         if len(self.task.motors) > 1:
             raise ValueError(
@@ -192,7 +196,7 @@ class TaskEnvSource(EnvSource):
             )
         return self.task
 
-    def as_with_motors(self, config: Any) -> Any:
+    def with_motor_steps(self, config: Any) -> Any:
         """Return a configuration on MuJoCo, with the integration steps that a motor would need."""
         inner_steps = (
             {}

@@ -135,13 +135,13 @@ def demands_of(
                 " task's and not a motor's; train it with --actuator ideal, or name the task"
                 " instead"
             )
-        env = env.source.as_with_motors(env)
+        env = env.source.with_motor_steps(env)
         episodes_run = run_episodes(load_policy(path, trust), env.make, episodes, seed)
         return _demands_from_episodes(f"the policy {path.name} of {env.task}", env, episodes_run)
     from codrl_mj.sizing.scripted import Scripted, observe_state
 
     env = EnvConfig(str(subject), "ideal")
-    policy, env = Scripted(env.source.scripted), env.source.as_with_motors(env)
+    policy, env = Scripted(env.source.scripted_task), env.source.with_motor_steps(env)
     episodes_run = run_episodes(policy, lambda: observe_state(env.make()), episodes, seed)
     return _demands_from_episodes(f"{policy.description} of {env.source.name}", env, episodes_run)
 
