@@ -85,8 +85,8 @@ def _motor_at(model: mujoco.MjModel, index: int, plugin_slot: int) -> ActuatorMo
     if uses_plugin and model.plugin[instance] != plugin_slot:
         raise ValueError(
             f"plugin slot = {model.plugin[instance]}: a motor of codrl_mj needs {plugin_slot}, the"
-            " slot of its plugin. The model was compiled in a process with other plugins: compile it in"
-            " this process, from XML or a spec"
+            " slot of its plugin. The model was compiled in a process with other plugins: compile it"
+            " in this process, from XML or a spec"
         )
     if uses_plugin and (len(user) < PLUGIN_HEADER_SIZE or tuple(user[:2]) != SIGNATURE):
         raise ValueError(REASONS[1])
