@@ -96,8 +96,7 @@ if hasattr(os, "register_at_fork"):
 def register_symbol(name: str, address: int) -> str:
     """Register an address of this process under a symbol's name, by which compiled code finds it.
 
-    If the name already has another address, because a module was imported twice, a new name is
-    registered. The name is returned.
+    If the name already has another address, as after a copy of a module, a new name is returned.
     """
     while _SYMBOLS.setdefault(name, address) != address:
         name += "_"
@@ -320,8 +319,7 @@ def _hash_value(key: Any, value: Any, names: tuple[str, ...], visited: dict[int,
             _hash_value(key, element, names, visited)
         return
     if not isinstance(value, python_types.ModuleType):
-        # A recursive function reaches itself. A value that was visited before is hashed by its
-        # number in the order of visits.
+        # A second visit, as of a recursive function, hashes only the number of the first visit.
         if id(value) in visited:
             key.update(f"again {[*visited].index(id(value))}\n".encode())
             return
@@ -389,11 +387,7 @@ def _hash_value(key: Any, value: Any, names: tuple[str, ...], visited: dict[int,
 
 
 def _hash_function(key: Any, function: Any, visited: dict[int, Any]) -> None:
-    """Hash a function: its name, code, defaults, closure and globals.
-
-    The source file of a user's function is hashed too. Functions of `_VERSIONED_PACKAGES` are
-    identified by their name, because the packages' versions are in the key.
-    """
+    """Hash a function's name and, outside `_VERSIONED_PACKAGES`, its code and all it refers to."""
     code, scope, root = (
         function.__code__,
         function.__globals__,

@@ -362,10 +362,7 @@ def build(cls: type, mapping: object, label: str, prefix: str = "") -> Any:
 
 
 def part(absent: Any) -> Any:
-    """Return a field for an optional nested dataclass.
-
-    Its default is None. `absent` is the dataclass whose values apply then.
-    """
+    """Return a field for an optional nested dataclass; with None, the values of `absent` apply."""
     return dataclasses.field(default=None, metadata={"absent": absent})
 
 

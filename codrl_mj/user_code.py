@@ -116,10 +116,7 @@ def compile_error_message(function: Callable[..., Any], error: Exception) -> str
 
 
 def asset_folder() -> Path:
-    """Return the folder with MJCF files and `motors/`.
-
-    It is `assets/` in the repository, and `_assets/` in the package of an installed wheel.
-    """
+    """Return the folder with MJCF files and `motors/`: `assets/`, or `_assets/` in a wheel."""
     package = Path(__file__).parent
     for folder in (package / "_assets", package.parent / "assets"):
         if folder.is_dir():

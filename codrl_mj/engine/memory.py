@@ -31,9 +31,7 @@ passes each entry of a tuple as an argument: a call with a drive's parameters wo
 
 
 def llvm_intrinsic(signature: Callable[..., Any]) -> Callable[[Any], Any]:
-    """Return a decorator that makes a numba intrinsic of a code generator.
-
-    The generator is a function of (context, builder, signature, arguments).
+    """Return a decorator for code generators (context, builder, signature, arguments).
 
     Args:
         signature: a function of the argument types that returns numba's signature.

@@ -85,8 +85,8 @@ def _motor_at(model: mujoco.MjModel, index: int, plugin_slot: int) -> ActuatorMo
     if uses_plugin and model.plugin[instance] != plugin_slot:
         raise ValueError(
             f"plugin slot = {model.plugin[instance]}: a motor of codrl_mj needs {plugin_slot}, the"
-            " slot of its plugin. The model was compiled in a process with other plugins: compile it"
-            " in this process, from XML or a spec"
+            " slot of its plugin. The model was compiled in a process with other plugins: compile"
+            " it in this process, from XML or a spec"
         )
     if uses_plugin and (len(user) < PLUGIN_HEADER_SIZE or tuple(user[:2]) != SIGNATURE):
         raise ValueError(REASONS[1])
@@ -283,9 +283,8 @@ def _loop_radius(
 ) -> tuple[Callable[..., float], list[int]]:
     """Return a function for the spectral radius, and the numbers of the linear actuators.
 
-    Actuators are numbered in the order of `actuators`. The function takes a step [s] and the
-    numbers of the actuators whose loops are closed; without numbers, the loops of all linear
-    actuators are closed.
+    The function takes a step [s] and the numbers, in the order of `actuators`, of those whose loops
+    are closed; without numbers, the loops of all linear actuators are closed.
     """
     joints, motors = _joints(model, data, actuators, explicit), list(actuators.values())
     advances = [motor.advance if held else compiled_advance(type(motor)) for motor in motors]

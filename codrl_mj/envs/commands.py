@@ -408,10 +408,9 @@ def _dof(model: mujoco.MjModel, index: int) -> int:
 def _holding_control(
     model: mujoco.MjModel, index: int, actuator: ActuatorModel
 ) -> tuple[float, float]:
-    """Return slope and offset of the control that holds an actuator in place.
+    """Return slope and offset of the control slope*length + offset that holds an actuator.
 
-    The control is slope*length + offset, with the actuator's length. Both are 0 if the control is a
-    force.
+    Both are 0 if the control is a force.
     """
     if actuator.MOTION:
         command = next(iter(actuator.commands().values()))

@@ -542,8 +542,7 @@ def _type_of_field(family: Family, path: str) -> type:
 def _depends_on(quantity: Callable[[ActuatorModel], Any], motor: ActuatorModel, path: str) -> bool:
     """Return True if a quantity of a motor depends on a field.
 
-    A factor of 0 in a product would hide the dependence, so the test is repeated with all fields
-    at 2.
+    A factor of 0 would hide the dependence, so the test is repeated with all fields at 2.
     """
     family: Family = type(motor)
     fields, field = field_paths(family), split_pattern(path)[1]

@@ -28,8 +28,7 @@ class ActuatedVecEnv(VecEnv):
         """Wrap a vector environment in `SAME_STEP` mode.
 
         Raises:
-            ValueError: the agents cannot use its observations, actions or autoreset mode. The
-                environment is closed first.
+            ValueError: the agents cannot use its spaces or autoreset mode; it is closed first.
         """
         observation_space, action_space, problem = (
             env.single_observation_space,

@@ -55,8 +55,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
                 message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
-        # The last argument is the memory of one environment [bytes], which is larger if a function
-        # makes it.
+        # The last argument is the memory of one environment [bytes].
         check_counts(num_envs, max_episode_steps, 20_000 if isinstance(task, str) else 200_000)
         if num_threads not in (0, 1):
             raise ValueError(
@@ -95,8 +94,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
     def randomization(self) -> dict[str, Array]:
         """Drawn values of the present episodes: path -> array (N,), and the number `rejected`.
 
-        A field that is drawn for some motors has the path PATTERN:FIELD. The mapping is empty if
-        nothing is randomized.
+        A field drawn for some motors has the path PATTERN:FIELD. Empty if nothing is randomized.
         """
         values_of_envs = []
         for env_values in self.get_attr("randomization"):

@@ -47,9 +47,8 @@ _UNITS = (
 class EnvSource(abc.ABC):
     """Source of environments; a subclass defines `name` and `make`, and may override the rest.
 
-    `make` returns a Gymnasium environment with motors that the package can record. To create one,
-    call `codrl_mj.make` with a function that returns an environment with MuJoCo's `model` and
-    `data`.
+    `make` returns a Gymnasium environment whose motors can be recorded. `codrl_mj.make` creates it
+    from any function that returns an environment with MuJoCo's `model` and `data`.
     """
 
     name: str
@@ -257,11 +256,7 @@ class EnvSource(abc.ABC):
         return {"render_mode": "rgb_array"}
 
     def scene(self, config: Any) -> tuple[Any, Any, str | None]:
-        """Return the objects for rendering recorded states.
-
-        Returns:
-            The model; a function (state) -> `MjData`, or None; and a camera's name, or None.
-        """
+        """Return a model for rendering, a function (state) -> `MjData` or None, a camera or None."""
         with contextlib.closing(config.make()) as env:
             return env.unwrapped.model, None, None
 
@@ -383,8 +378,7 @@ def pattern_mapping(actuator: Any) -> Mapping[str, Any] | None:
 def is_source_name(name: str) -> bool:
     """Return True if a text has the form of a source's name, such as any `module:NAME`.
 
-    The path of an existing folder does not count, even if it looks like a Gymnasium id
-    (`runs/swing-v2`).
+    The path of a folder does not, even if it looks like a Gymnasium id (`runs/swing-v2`).
     """
     if name in TASKS or re.fullmatch(r"[\w.]+:[\w.]+", name) is not None:
         return True

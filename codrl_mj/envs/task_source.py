@@ -276,10 +276,7 @@ class TaskEnvSource(EnvSource):
         ]
 
     def at_goal(self, episode: Any) -> np.ndarray | None:
-        """Return a bool array, True for states at the goal.
-
-        A task without a goal is at its goal in all states, unless the episode terminated.
-        """
+        """Return True for states at the goal; without a goal, for all if it did not terminate."""
         if self.task.goal is None:
             return np.full(len(episode.state), not episode.terminated)
         return np.asarray(self.task.goal(episode.state.T), dtype=bool)
