@@ -4,9 +4,8 @@
     >>> import codrl_mj
     >>> env = gym.make("codrl_mj/CartPole-v0", actuator="weaker")
 
-Importing the package registers its environments with Gymnasium. The import is necessary, because
-Gymnasium loads no plugins since version 1.0. Every public name is imported on first use, so that
-`import codrl_mj` is fast.
+Importing the package registers its environments; since version 1.0, Gymnasium does not import it by
+itself. Every public name is imported on first use, so that `import codrl_mj` is fast.
 """
 
 import importlib

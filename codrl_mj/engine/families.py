@@ -206,8 +206,7 @@ def compiled_function(
 ) -> Any:
     """Compile a user's function, and check that its result has the declared form.
 
-    The check compiles the function. Both are skipped if the function passed the check in an earlier
-    process.
+    The check compiles it; both are skipped if the function passed in an earlier process.
     """
     compiled, marker = internal(function), VerifiedMarker("fits", function, form, argument_types)
     try:

@@ -76,7 +76,7 @@ def write(name: str, value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
             raise AttributeError(f"it is compiled into the step: make an environment with {known}")
         if setup.randomization.distributions:
             raise AttributeError(
-                "actuator or model are drawn at every reset: draw this, too, with `randomize`"
+                "actuator or model are drawn at every reset: give `randomize` a distribution for it"
             )
         if isinstance(attribute, ModelNumber):
             _write_number(name, attribute, value, setup, model)

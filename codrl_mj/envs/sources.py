@@ -256,7 +256,7 @@ class EnvSource(abc.ABC):
         return {"render_mode": "rgb_array"}
 
     def scene(self, config: Any) -> tuple[Any, Any, str | None]:
-        """Return a model for rendering, a function (state) -> `MjData` or None, a camera or None."""
+        """Return the model to render, a function (state) -> `MjData` or None, a camera or None."""
         with contextlib.closing(config.make()) as env:
             return env.unwrapped.model, None, None
 
