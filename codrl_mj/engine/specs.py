@@ -79,7 +79,7 @@ def add_motors(
         allow_unstable: accept motors that are unstable at the model's step.
         joint_dynamics: treatment of the model's damping, armature and frictionloss at a motor's
             joint, tendon or actuator, if the motor has the same quantity. `keep` adds both;
-            `replace` removes the model's value, if it describes the motor. None adds both and warns.
+            `replace` removes the model's, if it describes the motor. None adds both and warns.
 
     Returns:
         A new spec, not compiled yet.
