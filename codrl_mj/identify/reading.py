@@ -341,7 +341,7 @@ def _read_table(path: Path) -> Table:
         text = content.decode(
             "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
         )
-    # Instruments write signs such as those of degrees and micro in Latin-1.
+    # Instruments often write signs such as ° and µ in Latin-1.
     except UnicodeDecodeError:
         text = content.decode("latin-1")
     return _json(json.loads(text)) if kind == ".json" else _csv(text)
