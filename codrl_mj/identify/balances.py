@@ -1,10 +1,10 @@
 """Regressions of the voltage and torque balances of a log, and time lags between its signals.
 
-Both balances are multiplied by functions phi whose value and slope vanish at both ends of a window,
-and integrated by parts: the derivatives move from the signals to phi. Source: Shinbrot, *On the
-Analysis of Linear and Nonlinear Systems* (1957), the method of modulating functions. The results
-are good enough for signs, orders of magnitude and initial guesses; noise in the regressors biases
-them.
+The regressions use modulating functions: both balances are multiplied by functions phi whose value
+and slope vanish at both ends of a window, and integrated by parts, so that no signal has to be
+differentiated. Source: Shinbrot, *On the Analysis of Linear and Nonlinear Systems* (1957). The
+results are good enough for signs, orders of magnitude and initial guesses, but biased by noise in
+the regressors.
 """
 
 import math
@@ -16,9 +16,9 @@ import numpy as np
 from codrl_mj.identify.log import Log, gapless_stretches, sensor_deviation
 
 _MIN_ROWS = 12
-"""Smallest number of rows in a window."""
+"""Minimum number of rows in a window."""
 _MAX_LAG_ROWS = 20_000
-"""Largest number of rows, from the start of a log, in the estimate of a lag."""
+"""Maximum number of rows that a lag is estimated from, counted from the start of the log."""
 _MAX_LAG_WINDOWS = 400  # more windows do not make a lag more accurate
 # With the fifth power, phi'' is smooth at both ends of a window, so that the trapezoidal rule
 # integrates it accurately.
@@ -27,7 +27,7 @@ _UNIT_BUMP = _BUMP / _BUMP.integ()(1.0)
 _PHI = {-1: _UNIT_BUMP.integ(), 0: _UNIT_BUMP, 1: _UNIT_BUMP.deriv(), 2: _UNIT_BUMP.deriv(2)}
 """Order of phi's derivative with respect to the phase -> polynomial; -1: its integral."""
 NONNEGATIVE_TERMS = ("inertia", "viscous", "coulomb")
-"""Terms of a torque balance that are never negative for a physical body and its friction."""
+"""Terms of a torque balance whose coefficients are physically never negative."""
 
 
 class Balance(NamedTuple):
@@ -40,10 +40,13 @@ class Balance(NamedTuple):
 
 
 class Windows:
-    """Overlapping windows of a log, which weight signals by phi ~ (s - s^2)^5, s in [0, 1]."""
+    """Overlapping windows of a log; within each, signals are weighted by phi ~ (s - s^2)^5.
+
+    The phase s grows from 0 to 1 over a window.
+    """
 
     def __init__(self, log: Log, duration: float = 0.0, max_windows: int = 20_000) -> None:
-        """Cut a log into windows of a duration [s], but of at least `_MIN_ROWS` rows."""
+        """Cut a log into windows of a duration [s], each of at least `_MIN_ROWS` rows."""
         # At least ten windows have to fit into the log.
         duration = min(duration, float(log.time[-1] - log.time[0]) / 10.0)
         count = max(math.ceil(duration / log.step), _MIN_ROWS)
@@ -66,8 +69,7 @@ class Windows:
     def mean(self, signal: str | np.ndarray, order: int = 0) -> np.ndarray:
         """Return the weighted mean of a signal's `order`-th derivative, shape (windows,)."""
         values = (self._log.signals[signal] if isinstance(signal, str) else signal)[self.rows]
-        # A constant has no derivative: subtracting the mean avoids the rounding errors of a large
-        # offset.
+        # A constant offset does not change the derivative. Without it, rounding errors are smaller.
         if order > 0:
             values = values - values.mean(axis=1, keepdims=True)
         if order not in self._weights:
@@ -84,11 +86,11 @@ class Windows:
         The signal is delayed by `lag` [s].
         """
         values, time = self._log.signals[signal], self._log.time
-        # With a lag, rows outside a window act within it.
+        # With a lag, values from rows outside a window are still held within it.
         reach = 0 if lag == 0.0 else math.ceil(abs(lag) / self._log.step) + 1
         rows = np.arange(-reach, self.rows.shape[1] - 1 + reach) + self.rows[:, :1]
         rows = np.clip(rows, 0, len(time) - 2)
-        # A zero-order hold is integrated exactly: each value times the integral of phi over a row.
+        # This is exact: each held value is multiplied by the integral of phi while it is held.
         edges = [
             np.clip((time[rows + k] + lag - self.begin) / self.length, 0.0, 1.0) for k in (0, 1)
         ]
@@ -153,12 +155,13 @@ def _speed(log: Log, windows: Windows, order: int = 0) -> np.ndarray:
 
 
 def _voltage_terms(log: Log, windows: Windows, sag: bool = False) -> dict[str, np.ndarray]:
+    """Return the regressors of a voltage balance, each of shape (windows,)."""
     terms = {"resistance": windows.mean("current"), "inductance": windows.mean("current", 1)}
     if log.has("position") or log.has("velocity"):
         terms["back_emf_constant"] = _speed(log, windows)
     if sag:
-        # A bridge draws the share u/V of the current i from the supply, and passes on the same
-        # share of the supply's voltage drop: the drop at the motor grows with the squared share.
+        # At a duty d = u/V a bridge draws the current d*i from the supply, and applies the share d
+        # of the voltage that is left: the voltage drop at the motor grows with d^2*i.
         share = log.signals["voltage"] / max(float(np.abs(log.signals["voltage"]).max()), 1e-300)
         terms["supply_resistance"] = windows.mean(share**2 * log.signals["current"])
     return terms
@@ -177,6 +180,7 @@ def voltage_balance(log: Log, duration: float = 0.0, sag: bool = False) -> Balan
 def _torque_terms(
     log: Log, windows: Windows, is_tilted: bool = False, rig: str | None = None
 ) -> dict[str, np.ndarray]:
+    """Return the regressors of a torque balance, each of shape (windows,)."""
     from scipy.integrate import cumulative_trapezoid
 
     speed, constant = _speed(log, windows), windows.mean(np.ones(len(log.time)))
@@ -213,14 +217,14 @@ def torque_balance(
     `constant`.
 
     Args:
-        log: log with the effort, and a position or a velocity. A velocity without a position is
-            integrated from the angle 0, at which the pendulum hangs.
-        effort: `torque`, `current` or `voltage`.
+        log: log with the effort, and a position or a velocity. Without a position, the velocity is
+            integrated, beginning at the angle 0, at which the pendulum hangs.
+        effort: signal that drives the shaft: `torque`, `current` or `voltage`.
         duration: duration of the windows [s].
         is_tilted: True to add `gravity_aside`*cos(q), for a pendulum that does not hang at 0.
-        rig: `pendulum` or None for a gravity term; `free` or `load` for none.
-        sign: 1 or -1 multiplies the effort and forbids negative inertia and friction; 0 leaves the
-            effort unchanged and allows them.
+        rig: `pendulum` or None to include gravity; `free` or `load` to leave it out.
+        sign: factor of the effort, 1 or -1, with inertia and friction constrained to be >= 0; with
+            0 the effort is unchanged, and nothing is constrained.
     """
     windows = Windows(log, duration)
     terms = _torque_terms(log, windows, is_tilted, rig)
@@ -233,13 +237,13 @@ class Shift(NamedTuple):
 
     lag: float  # [s]
     residual_ratio: float  # residual at that shift over the residual without a shift
-    gain: float  # factor between the two signals
+    gain: float  # the shifted signal over the other one
     unexplained: float  # RMS of the residual at that shift over the RMS of the target
     noise: float = 0.0  # noise-to-signal ratio of the worse sensor, quantization included
 
 
 def velocity_lag(log: Log) -> Shift | None:
-    """Estimate lag (up to 0.1 s) and gain of the velocity relative to the position's derivative."""
+    """Estimate the lag (up to 0.1 s) and gain of the velocity against the position's derivative."""
     log = log.slice_rows(slice(0, _MAX_LAG_ROWS))
     windows = Windows(log, max(0.05, 4.0 * log.step), _MAX_LAG_WINDOWS)
     rate = windows.mean("position", 1)
@@ -259,8 +263,8 @@ def velocity_lag(log: Log) -> Shift | None:
     rate_rms, velocity_rms = (
         float(np.sqrt(np.mean(values**2))) for values in (rate, windows.mean("velocity"))
     )
-    # A window averages the noise of its rows, of which phi uses about half; it differentiates the
-    # position over about a quarter of its length.
+    # Noise is averaged over the rows of a window, of which phi weights about half. The position is
+    # differentiated over about a quarter of a window.
     velocity_noise = sensor_deviation(log, "velocity") * math.sqrt(2.0 / windows.rows.shape[1])
     rate_noise = 4.0 * sensor_deviation(log, "position") / float(windows.length.mean())
     noise = max(velocity_noise / max(velocity_rms, 1e-300), rate_noise / rate_rms)
@@ -268,10 +272,10 @@ def velocity_lag(log: Log) -> Shift | None:
 
 
 def effort_lag(log: Log, effort: str) -> Shift | None:
-    """Estimate the lag of a response to an effort, which minimizes the residual of their balance.
+    """Estimate the lag between an effort and its response, by the residual of their balance.
 
-    The response to a `voltage` is the current, with a lag of up to 20 rows; the response to a
-    `torque` is the motion, with a lag of up to 60 ms.
+    The response to a `voltage` is the current, whose lag is searched up to 20 rows. The response to
+    a `torque` is the motion, whose lag is searched up to 60 ms.
     """
     log = log.slice_rows(slice(0, _MAX_LAG_ROWS))
     if effort == "voltage":
@@ -287,8 +291,8 @@ def effort_lag(log: Log, effort: str) -> Shift | None:
 
     def compare(lag: float) -> tuple[float, float, float]:
         balance = regress(windows.mean_held(effort, lag), terms)
-        # With a nearly sinusoidal current a delay cannot be distinguished from a larger inductance.
-        # Too long a delay is compensated by a negative inductance, and is rejected for that reason.
+        # With a nearly sinusoidal current, a delay looks the same as a larger inductance. A delay
+        # that is too long makes the inductance negative, and is rejected.
         if balance is None or (lag > 0.0 and balance.t_values.get("inductance", 0.0) < -3.0):
             return np.inf, 1.0, 1.0
         return balance.residual, 1.0, balance.unexplained
@@ -304,18 +308,18 @@ def _search_lag(
     max_lead: float,
     max_lag: float,
 ) -> Shift:
-    """Search for the shift with the smallest residual, with a resolution of a quarter of a step.
+    """Search for the lag with the smallest residual, to about a quarter of a time step.
 
     A coarse grid is refined around its best point. `compare` returns the residual, the gain and the
     unexplained share at a lag.
     """
-    # At most 40 points of the coarse grid cover the range.
+    # The coarse grid has at most about 40 points.
     shift = step
     while max_lead + max_lag > 40.0 * shift:
         shift *= 2.0
     lags = shift * np.arange(-max(round(max_lead / shift), 4), max(round(max_lag / shift), 4) + 1)
     while True:
-        # Of equal residuals the shorter shift wins.
+        # If residuals are equal, the shorter lag wins.
         best = min((compare(lag)[0], abs(lag), lag) for lag in lags)[2]
         if shift <= 0.3 * step:
             residual, gain, unexplained = compare(best)

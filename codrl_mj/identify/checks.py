@@ -46,26 +46,26 @@ FACTORS = {
     "degrees for radians": 180.0 / math.pi,
     "rpm for rad/s": 30.0 / math.pi,
     "turns for radians": 2.0 * math.pi,
-    "thousandths for units, as mA for A or ms for s": 1000.0,
-    "hundredths for units, as N*cm for N*m or percent for shares": 100.0,
+    "thousandths for units, such as mA for A or ms for s": 1000.0,
+    "hundredths for units, such as N*cm for N*m or percent for shares": 100.0,
     "kgf*cm for N*m": 10.197,
     "degrees for turns": 360.0,
     "rpm for turn/s": 60.0,
 }
-"""Mix-up of units -> factor by which two values that should be equal differ, or its inverse."""
+"""Mix-up of units -> factor that it causes between two values, or the inverse of that factor."""
 # The smallest resistance would draw 1 kA at 5 V; micromotors have some hundreds of ohms.
 _RESISTANCES = (5e-3, 1e4)
 """Range of plausible resistances of motors on a bench [ohm]."""
 _MIN_T_VALUE = 10.0
 """Smallest coefficient over its standard error that counts as significant."""
 _MAX_FLIPPED_RESIDUAL = 2.0 / 3.0
-"""Largest residual with a flipped sign, over the residual with the logged one, at which the logged
-sign counts as wrong.
+"""Largest ratio of the residual with a flipped sign to that with the logged sign, at which the
+logged sign counts as wrong.
 """
 _MAX_NOISE = 0.1
 """Noise-to-signal ratio above which no error of the velocity is reported."""
 _MIN_TILT = 0.03
-"""Smallest reported angle [rad] between the hanging pendulum and position 0."""
+"""Smallest reported angle [rad] between the pendulum at rest and position 0."""
 
 
 class LogFacts(NamedTuple):
@@ -74,17 +74,17 @@ class LogFacts(NamedTuple):
     log: Log
     motor: Any  # the `GearMotor` of a datasheet, or None
     rig: str | None
-    effort: str  # logged input that is nearest to the shaft; empty if there is none
-    conditions: set[str]  # signals of the log and facts about it, as named in `CHECKS`
+    effort: str  # logged torque, or else current, or else voltage; empty if there is none
+    conditions: set[str]  # signals of the log, and conditions that it meets; see `check`
     winding: Balance | None  # R, L and kE from the voltage balance; None if it has no solution
 
 
 CHECKS: list[tuple[set[str], Callable[[LogFacts], Iterator[Finding]]]] = []
-"""Conditions of each check, and its function, in the order in which they run."""
+"""Conditions under which a check applies, and its function; checks run in this order."""
 
 
 def _needs(words: str) -> Callable[[Any], Any]:
-    """Return a decorator that adds a check to `CHECKS`, with conditions separated by spaces."""
+    """Return a decorator that registers a check with conditions, separated by spaces."""
 
     def add(function: Any) -> Any:
         CHECKS.append(({*words.split()}, function))
@@ -98,8 +98,8 @@ def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
 
     Args:
         log: log, as read from its file.
-        motor: `GearMotor` of a datasheet, to compare with; None skips the comparison.
-        rig: `pendulum`, `free` or `load`; None counts as a pendulum.
+        motor: `GearMotor` of a datasheet to compare with; None skips the comparison.
+        rig: `pendulum`, `free` or `load`; None is treated as `pendulum`.
     """
     # The torque is nearest to the shaft; current and voltage act on the shaft through the winding.
     effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), "")
@@ -123,7 +123,11 @@ def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
 
 
 def explain_factor(ratio: float, angle: bool = True) -> str:
-    """Return explanations of a ratio: confused units within 8 % of it, a scale or a gear."""
+    """Return possible causes of a wrong ratio: mixed-up units, a wrong scale or a gear.
+
+    Mixed-up units are named if their factor is within 8 % of the ratio; units of angles only if
+    `angle` is True.
+    """
     size = abs(math.log(abs(ratio)))
     near = [
         f"{name} ({factor:.4g})"
@@ -137,7 +141,7 @@ def explain_factor(ratio: float, angle: bool = True) -> str:
 
 @_needs("")
 def _obstacle(facts: LogFacts) -> Iterator[Finding]:
-    """Find the reason why a fit would refuse this log."""
+    """Find the reason why a fit would reject this log."""
     if finding := find_obstacle([facts.log]):
         yield finding
 
@@ -151,7 +155,7 @@ def _times(facts: LogFacts) -> Iterator[Finding]:
     for row in gaps[:_MAX_LISTED]:
         text = (
             f"a gap of {steps[row]:.4g} s after {log.time[row]:.4g} s,"
-            f" {steps[row] / usual:.0f} usual steps"
+            f" {steps[row] / usual:.0f} times the usual step"
         )
         yield Finding("warning", "gap", int(rows[row + 1]), text, "nothing is simulated across it")
     if gaps.size > _MAX_LISTED:
@@ -171,7 +175,7 @@ def _times(facts: LogFacts) -> Iterator[Finding]:
         )
         severity = "warning" if share > 0.01 else "info"
         yield Finding(severity, "dropped rows", int(rows[dropped[0] + 1]), text, remedy)
-    # Steps with missing rows are left out, because they would count as jitter.
+    # Steps across missing rows are left out, because they would count as jitter.
     regular = steps[steps <= _DROPPED_STEPS * usual]
     jitter = float(np.std(regular)) / usual
     if jitter > 0.02:
@@ -182,7 +186,7 @@ def _times(facts: LogFacts) -> Iterator[Finding]:
             f"steps of {regular.min():.3g} to {regular.max():.3g} s around {usual:.3g} s,"
             f" with a standard deviation of {jitter:.0%}"
         )
-        remedy = "take each stamp when the values are read"
+        remedy = "take each time stamp when the values are read"
         yield Finding(
             "warning" if jitter > 0.3 else "info", "jitter", int(rows[worst + 1]), text, remedy
         )
@@ -322,8 +326,8 @@ def _velocity(facts: LogFacts) -> Iterator[Finding]:
         yield Finding(
             "error", "sign", None, text, "give one of them a minus: velocity=-column:unit"
         )
-    # Noise of the position makes the regression's gain too small, noise of the velocity makes the
-    # inverse regression's gain too large: the true gain is between them.
+    # Noise of the position makes the gain of this regression too small, and noise of the velocity
+    # makes the gain of the inverse regression too large. The true gain is between the two.
     ends = [math.log(abs(shift.gain)), math.log(abs(shift.gain) / (1.0 - shift.unexplained**2))]
     if clear and (min(ends) > 0.1 or max(ends) < -0.1):
         text = (
@@ -381,27 +385,27 @@ def _electrical(facts: LogFacts) -> Iterator[Finding]:
         remedy = "give position and velocity a minus, or voltage and current"
         yield Finding("error", "sign", None, text, remedy)
     for name, change in (
-        ("inductance", "quickly: a PRBS"),
-        ("back_emf_constant", "speed: a slow sine"),
+        ("inductance", "in which the voltage changes quickly, such as a PRBS"),
+        ("back_emf_constant", "in which the speed changes, such as a slow sine"),
     ):
         if name in values and abs(t_values[name]) < _MIN_T_VALUE:
             text = (
                 f"the log hardly shows the {name.replace('_', ' ')}: its estimate is only"
-                f" {abs(t_values[name]):.2g} standard errors"
+                f" {abs(t_values[name]):.2g} times its standard error"
             )
             yield Finding(
                 "info",
                 "excitation",
                 None,
                 text,
-                f"add a log that changes {change}, or give it by --known",
+                f"add a log {change}; or give the value with --known",
             )
     if balance.unexplained > 0.3:
         text = (
             f"R*i + L*di/dt + kE*speed leaves {balance.unexplained:.0%} of the voltage unexplained"
         )
         remedy = (
-            "check that the voltage is that at the terminals, and that there is a row for each of"
+            "check that it is the voltage at the terminals, and that a row is written for each of"
             " its changes"
         )
         yield Finding("warning", "voltage", None, text, remedy)
@@ -427,15 +431,15 @@ def _delay(facts: LogFacts) -> Iterator[Finding]:
             text,
             "check the delay that the fit reports, or shift a column of the log",
         )
-    # A voltage that was sampled at the time of a row represents the time from half a row before to
-    # half a row after it, but the balance holds it until the next row: it seems half a row late.
+    # A voltage sampled at a row represents the time from half a row before it to half a row after
+    # it. The balance holds it until the next row, so that it seems to be half a row late.
     elif -0.8 < rows < -0.2 and shift.residual_ratio < 0.8:
         declared = (
-            "declared as the mean to the next row" if log.mean_voltage else "held to the next row"
+            "as the mean until the next row" if log.mean_voltage else "as held until the next row"
         )
         text = (
             f"the voltage fits better about half a row earlier than {declared}: it was probably"
-            " sampled at the row's time"
+            " sampled at the time of the row"
         )
         remedy = "log the mean of the voltage, or a row for each of its changes"
         if log.mean_voltage:
@@ -478,10 +482,10 @@ def _mechanical(facts: LogFacts) -> Iterator[Finding]:
     if not balances:
         return
     balance, t_values = balances[0], balances[0].t_values
-    inertias = [fit.t_values.get("inertia", 0.0) for fit in balances]
-    inertia = max(inertias, key=abs) if max(inertias) < 3.0 else 0.0
-    is_negative = inertia < -_MIN_T_VALUE or (
-        t_values.get("gravity", 0.0) < -_MIN_T_VALUE and inertia < -3.0
+    inertia_t_values = [fit.t_values.get("inertia", 0.0) for fit in balances]
+    inertia_t = max(inertia_t_values, key=abs) if max(inertia_t_values) < 3.0 else 0.0
+    is_negative = inertia_t < -_MIN_T_VALUE or (
+        t_values.get("gravity", 0.0) < -_MIN_T_VALUE and inertia_t < -3.0
     )
     if is_negative and (shares := _explain_sign(log, effort, rig)):
         remedy = f"give the {effort}, or position and velocity, a minus"
@@ -490,9 +494,9 @@ def _mechanical(facts: LogFacts) -> Iterator[Finding]:
         )
     elif {"position", "hangs"} <= facts.conditions:
         yield from _zero(torque_balance(log, effort, is_tilted=True), effort)
-    # A smaller residual may come from the rounding of a torque that changes fast.
-    large = 0.08 * float(np.std(log.signals[effort]))
-    if effort == "torque" and balance.unexplained > 0.25 and balance.residual > large:
+    # A smaller residual may come from the quantization of a torque that changes fast.
+    min_residual = 0.08 * float(np.std(log.signals[effort]))
+    if effort == "torque" and balance.unexplained > 0.25 and balance.residual > min_residual:
         text = (
             f"the motion leaves {balance.unexplained:.0%} of the torque unexplained (mean over"
             " 0.3 s)"
@@ -508,16 +512,16 @@ def _mechanical(facts: LogFacts) -> Iterator[Finding]:
 
 
 def _explain_sign(log: Log, effort: str, rig: str | None) -> str:
-    """Return a text on how much better the effort fits with a minus; empty if it does not.
+    """Return a text on how much better the effort fits with a flipped sign; empty if it does not.
 
-    The check by standard errors alone may be wrong where static friction holds the shaft, or where
-    a controller produces the effort from the motion.
+    Standard errors alone may mislead if static friction holds the shaft, or if a controller
+    computes the effort from the motion.
     """
     for seconds in (0.3, 0.03):
         original, flipped = (
             torque_balance(log, effort, seconds, rig=rig, sign=sign) for sign in (1.0, -1.0)
         )
-        # The logged sign explains the effort well enough.
+        # Nothing is reported if the logged sign explains the effort well.
         if original is None or flipped is None or original.unexplained < 0.03:
             continue
         if flipped.residual < _MAX_FLIPPED_RESIDUAL * original.residual:
@@ -532,8 +536,8 @@ def _explain_sign(log: Log, effort: str, rig: str | None) -> str:
 def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
     """Find a pendulum that does not hang at position 0.
 
-    Under a voltage only a zero near the top is reported: friction and back-EMF leave too little of
-    the voltage for gravity.
+    If the effort is a voltage, only a position 0 near the top is reported, because gravity is a
+    small part of the voltage besides friction and back-EMF.
     """
     names = "gravity", "gravity_aside"
     if (
@@ -543,7 +547,7 @@ def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
         return
     along, aside = (balance.values.get(name, 0.0) for name in names)
     zero, pull = math.atan2(-aside, along), math.hypot(along, aside)
-    # Over a small arc gravity is nearly constant, and cancels against an opposite constant load.
+    # Over a small arc, gravity is nearly constant and looks the same as a constant load.
     if abs(balance.values.get("constant", 0.0)) > 0.5 * pull:
         return
     if pull > 2.0 * balance.residual and abs(zero) > (2.5 if effort == "voltage" else _MIN_TILT):
@@ -559,8 +563,8 @@ def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
 
 @_needs("motion")
 def _motion(facts: LogFacts) -> Iterator[Finding]:
-    """Find a shaft that stands still, or that turns one way only."""
-    signals, remedy = facts.log.signals, "leave position and velocity out if it is"
+    """Find a shaft that stands still, or that turns in one direction only."""
+    signals, remedy = facts.log.signals, "leave position and velocity out if it was locked"
     speed = signals["velocity"] if "velocity" in signals else np.diff(signals["position"])
     if "stands" in facts.conditions:
         yield Finding(
@@ -569,7 +573,7 @@ def _motion(facts: LogFacts) -> Iterator[Finding]:
     elif facts.effort and min(float(speed.max()), float(-speed.min())) < 0.05 * float(
         np.abs(speed).max()
     ):
-        text = "the shaft turns one way only: friction looks the same as a constant load"
+        text = "the shaft turns in one direction only: friction looks the same as a constant load"
         yield Finding("info", "excitation", None, text, "add a log that reverses")
 
 
@@ -579,7 +583,7 @@ def _two_constants(facts: LogFacts) -> Iterator[Finding]:
 
     In SI units they are equal, except for losses and the convention for star or delta windings.
     """
-    # The speed of longer windows is less affected by the resolution of an encoder.
+    # In longer windows, the speed is less affected by the resolution of an encoder.
     balance = facts.winding and (voltage_balance(facts.log, 0.1) or facts.winding)
     if balance is None or balance.t_values.get("back_emf_constant", 0.0) < _MIN_T_VALUE:
         return
@@ -592,7 +596,7 @@ def _two_constants(facts: LogFacts) -> Iterator[Finding]:
     elif abs(math.log(constant / back_emf)) > math.log(2.0):
         text = (
             f"torque/current is {constant:.3g} N*m/A and the back-EMF constant {back_emf:.3g}"
-            " V*s/rad, must be about "
+            " V*s/rad; they must be about "
         )
         text += f"equal: {explain_factor(constant / back_emf)}"
         yield Finding(
@@ -612,7 +616,7 @@ def _datasheet(facts: LogFacts) -> Iterator[Finding]:
         if abs(math.log(logged / value)) > math.log(2.0):
             unit = PARAMETERS[name].unit
             text = (
-                f"the {name.replace('_', ' ')} would be {logged:.3g} {unit}, the datasheet says"
+                f"the {name.replace('_', ' ')} would be {logged:.3g} {unit}, but the datasheet has"
                 f" {value:.3g} {unit}: "
             )
             remedy = "correct the units of voltage, current and motion, or name the right motor"

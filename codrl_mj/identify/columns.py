@@ -40,8 +40,8 @@ _EXAMPLE = "time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad"
 
 def twos_complement(values: Any, bits: Any) -> Any:
     """Return unsigned numbers read as two's complement: 65535 with 16 bits is -1."""
-    whole = 2.0 ** float(bits)
-    return (np.asarray(values) + whole / 2.0) % whole - whole / 2.0
+    modulus = 2.0 ** float(bits)
+    return (np.asarray(values) + modulus / 2.0) % modulus - modulus / 2.0
 
 
 def sign_magnitude(values: Any, bits: Any) -> Any:
@@ -59,9 +59,9 @@ FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "sign": (1, np.sign),
     "sqrt": (1, np.sqrt),
 }
-"""Function of a formula -> number of arguments, and the function.
+"""Name of a function in formulas -> number of arguments, and the function.
 
-A second argument must be a number, except for atan2.
+A second argument must be a constant, except for atan2.
 """
 _Value = Callable[[Mapping[str, Any]], Any]
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
@@ -77,12 +77,13 @@ class Column:
     """A signal as a formula of a file's columns."""
 
     signal: str  # `time`, one of `SIGNALS`, or `only`: rows where it is 0 are left out
-    # Columns (a name with spaces in quotes, column[0] of a list), numbers, `pi`, + - * / and
-    # `FUNCTIONS`.
+    # Expression of column names, numbers, `pi`, + - * / and `FUNCTIONS`. Names with spaces are in
+    # quotes; column[0] is the first entry of a column of lists.
     formula: str
-    # Unit of the formula's value; None: SI, which is allowed for formulas but not for bare names.
+    # Unit of the formula's value. None means SI, and is allowed only if the formula is not a mere
+    # column name.
     unit: str | None
-    # For a voltage: True if it is the mean until the next row, False if it is held from its row on.
+    # True if a voltage is the mean until the next row; False if it is held until the next row.
     mean: bool = False
 
     def __post_init__(self) -> None:
@@ -129,7 +130,7 @@ class Column:
 
     @functools.cached_property
     def _formula(self) -> tuple[_Value, set[str], bool]:
-        """Compiled formula without its unit, the names that it reads, and True for a bare name."""
+        """Compiled formula, the names that it reads, and True if it is only a name."""
         try:
             body = ast.parse(self.formula.strip(), mode="eval").body
         except SyntaxError as error:
@@ -202,7 +203,7 @@ class Column:
             return to_si(value, unit, kind, self.signal)
         except ValueError as error:
             raise self._error(
-                f"{error}; write {kind or '1'}, or another unit of its kind"
+                f"{error}; write {kind or '1'}, or another unit of the same kind"
             ) from error
 
 

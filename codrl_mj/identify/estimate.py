@@ -2,8 +2,8 @@
 
 The initial state of each segment is solved for within each evaluation, and its share of the
 Jacobian is projected out (Kaufman 1975, *A variable projection method for solving separable
-nonlinear least squares problems*). So the outer problem has only the parameters as unknowns,
-however many segments there are.
+nonlinear least squares problems*). The outer problem then has only the parameters as unknowns,
+regardless of the number of segments.
 """
 
 import abc
@@ -28,14 +28,15 @@ DELAYS = (-1, 1, 2, 3)
 MAX_DELAY = 20
 """Largest delay [rows]; delays beyond `DELAYS` are tried while the cost falls."""
 NUM_STARTS = 4
-# A delay is accepted if it passes both limits.
+"""Maximum number of initial guesses from which a fit is started."""
+# A delay is accepted only if both conditions hold.
 MAX_COST_RATIO = 0.8
 """Largest accepted ratio of the robust cost with a delay to the cost without it."""
-MIN_DEVIATIONS = 3.0
-"""Smallest accepted mean reduction of the segments' costs, in standard errors."""
-# Beyond both limits the log is faulty, or the model does not describe it.
+MIN_STANDARD_ERRORS = 3.0
+"""Smallest accepted mean reduction of the segments' costs, in standard errors of that mean."""
+# If a log exceeds both limits, it is faulty, or the model does not describe it.
 MAX_MEAN_RESIDUAL = 8.0
-"""Largest mean residual that may be noise, in standard deviations of the sensor."""
+"""Largest mean residual attributed to noise, in standard deviations of the sensor."""
 MAX_UNEXPLAINED_SHARE = 0.02
 """Largest unexplained share of the variation within a segment."""
 Simulate = Callable[[Segment, np.ndarray], np.ndarray]
@@ -44,10 +45,10 @@ Simulate = Callable[[Segment, np.ndarray], np.ndarray]
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Model(abc.ABC):
-    """A part of a motor with its input, its output, and its known and free parameters."""
+    """Model of a winding or a shaft: its input, output, known parameters and free parameters."""
 
-    driven_by: str  # signal of a log, the input
-    output: str  # signal of a log that a simulation is compared with
+    driven_by: str  # name of the input signal
+    output: str  # name of the signal that a simulation is compared with
     known: Mapping[str, float]  # values of parameters that are not fitted
     defaults: Mapping[str, float] = dataclasses.field(default_factory=lambda: DEFAULTS)
     """Values of parameters that are neither fitted nor known."""
@@ -65,7 +66,7 @@ class Model(abc.ABC):
         )
 
     def all_values(self, values: np.ndarray) -> dict[str, float]:
-        """Return all parameters by name, of which `values` are the free ones."""
+        """Return all parameters by name; `values` are those of the free ones, shape (p,)."""
         return {
             **self.defaults,
             **self.known,
@@ -78,7 +79,7 @@ class Model(abc.ABC):
 
     @abc.abstractmethod
     def initial_guess(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
-        """Return the model with its free parameters, and initial guesses, each of shape (p,)."""
+        """Return the model with free parameters set, and initial guesses, each of shape (p,)."""
 
     @abc.abstractmethod
     def simulator(self, values: np.ndarray) -> Simulate:
@@ -101,7 +102,7 @@ class Fit:
     states: tuple[np.ndarray, ...]  # initial state of each segment
     logs: tuple[Log, ...] = ()  # logs of the segments, with the delay of the input removed
     delay: float = 0  # delay of the input [rows]
-    start_fits: tuple["Fit", ...] = ()  # fits from each start
+    start_fits: tuple["Fit", ...] = ()  # short fits, one from each start, the best first
 
     @property
     def cost(self) -> float:
@@ -118,11 +119,12 @@ class Fit:
 
 
 def robust_cost(residuals: np.ndarray, scale: float) -> float:
-    """Return the soft-L1 loss, which is the sum of squares of small residuals."""
+    """Return the soft-L1 loss, which for small residuals is their sum of squares."""
     return float(2.0 * scale * scale * np.sum(np.sqrt(1.0 + (residuals / scale) ** 2) - 1.0))
 
 
 def _residuals(simulate: Simulate, segment: Segment, state: np.ndarray) -> np.ndarray:
+    """Return the residuals in standard deviations of the sensor, shape (m,)."""
     residuals = (simulate(segment, state) - segment.measured) / segment.deviation
     # A diverged simulation gets large finite residuals, from which the optimizer can step back.
     return (
@@ -156,11 +158,16 @@ def _fit_state(
             changed = state.copy()
             changed[index] += length
             columns[:, index] = (_residuals(simulate, segment, changed) - residuals) / length
-        # The weights of the soft-L1 loss make it a sum of weighted squares.
-        root, cost = (1.0 + (residuals / scale) ** 2) ** -0.25, robust_cost(residuals, scale)
-        step = np.linalg.lstsq(root[:, None] * columns, -root * residuals, rcond=1e-9)[0]
+        # Iteratively reweighted least squares: rows are scaled by the roots of the soft-L1 weights.
+        row_scales, cost = (
+            (1.0 + (residuals / scale) ** 2) ** -0.25,
+            robust_cost(residuals, scale),
+        )
+        step = np.linalg.lstsq(row_scales[:, None] * columns, -row_scales * residuals, rcond=1e-9)[
+            0
+        ]
         # Stop if the predicted reduction of the cost is negligible.
-        if np.sum((root * (columns @ step)) ** 2) < 1e-6 * cost:
+        if np.sum((row_scales * (columns @ step)) ** 2) < 1e-6 * cost:
             break
         for share in (1.0, 0.25):
             candidate = _residuals(simulate, segment, state + share * step)
@@ -182,14 +189,14 @@ def best_initial_state(model: Model, values: np.ndarray, segment: Segment) -> np
 class _Problem:
     """The outer least-squares problem in the parameters, for scipy.
 
-    Each evaluation fits the initial states, starting from those at the last Jacobian, which are
-    extrapolated linearly in the parameters.
+    Each evaluation fits the initial states. It starts from the states of the last Jacobian,
+    extrapolated linearly to the new parameters.
     """
 
     def __init__(
         self, model: Model, segments: Sequence[Segment], states: Sequence[np.ndarray], scale: float
     ) -> None:
-        """Start from initial states of the segments."""
+        """Start from guesses of the initial states of the segments."""
         self.model, self.segments, self.scale = model, segments, scale
         # States and their derivatives with respect to the parameters, at the parameters `origin`.
         self.states = list(states)
@@ -218,7 +225,7 @@ class _Problem:
         return self.solution[1]
 
     def choose_best_states(self, values: np.ndarray) -> None:
-        """Take the better initial state of each segment, from the solution or from its guess."""
+        """Refit each initial state from its original guess, and keep the better of the two fits."""
         pairs = zip(
             self.solve(values),
             self.fit_states(values, [segment.state for segment in self.segments]),
@@ -247,9 +254,9 @@ class _Problem:
                     _residuals(simulate, segment, state) - residuals
                 ) / change.sum()
             # The state follows the parameters such that the residuals stay minimal.
-            root = ((1.0 + (residuals / self.scale) ** 2) ** -0.25)[:, None]
+            row_scales = ((1.0 + (residuals / self.scale) ** 2) ** -0.25)[:, None]
             self.slopes.append(
-                -np.linalg.lstsq(root * state_columns, root * columns, rcond=1e-9)[0]
+                -np.linalg.lstsq(row_scales * state_columns, row_scales * columns, rcond=1e-9)[0]
             )
             jacobians.append(columns + state_columns @ self.slopes[-1])
         return jacobians
@@ -266,7 +273,7 @@ def fit_from_starts(
     starts: Sequence[np.ndarray],
     on_start: Callable[[], None] = lambda: None,
 ) -> tuple[Fit, tuple[Fit, ...]]:
-    """Return the best fit from several starts, and the fit from each start, the best first."""
+    """Return the best fit from several starts, and the short fits from all starts, best first."""
     fits = []
     for start in starts:
         fits.append(
@@ -307,8 +314,8 @@ def optimize(
         model: model with its free parameters.
         segments: segments to fit.
         start: initial guess, shape (p,).
-        max_evaluations: largest number of evaluations; 0 leaves the parameters at the start.
-        scale: residual above which a residual counts as an outlier; None derives it from the
+        max_evaluations: maximum number of evaluations; 0 leaves the parameters at the start.
+        scale: size above which a residual counts as an outlier; None derives it from the
             residuals at the start.
         states: initial states of the segments; None fits them at the start.
     """
@@ -361,10 +368,10 @@ def refit_model(fit: Fit, model: Model) -> Fit:
 def fit_model(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None) -> Fit:
     """Fit a model to logs from several starts, and then the delay of its input.
 
-    For a winding, delays of half a row are tried, too. If they fit clearly worse, the voltage was
-    held between rows, so that each value is also the mean until the next row (`mean_voltage`). If
-    one fits clearly better, the voltage was sampled at the times of the rows, and that delay is
-    kept.
+    For a winding, a delay longer and one shorter by half a row are tried, too. If both fit clearly
+    worse, the voltage was held between rows. If one fits clearly better, the voltage was sampled at
+    the times of the rows, and that delay is used. In both cases the shifted voltage equals the mean
+    until the next row, and the logs of the fit are marked with `mean_voltage`.
     """
     segments = model.segments(logs)
     model, starts = model.initial_guess(segments)
@@ -379,7 +386,7 @@ def fit_model(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = l
         return [shift_signal(log, model.driven_by, delay) for log in logs]
 
     def try_delays(*delays: float) -> float:
-        """Compute the costs of delays, and return the best accepted delay."""
+        """Compute the costs of delays, and return the best one so far; 0 if not accepted."""
         for candidate in delays:
             costs[candidate] = optimize(
                 model, model.segments(delayed_logs(candidate)), fit.values, 20, fit.scale
@@ -415,7 +422,7 @@ def _is_better(costs: np.ndarray, reference: np.ndarray) -> bool:
     error = reductions.std(ddof=1) / np.sqrt(len(reductions)) if len(reductions) > 1 else 0.0
     return bool(
         costs.sum() < MAX_COST_RATIO * reference.sum()
-        and reductions.mean() > MIN_DEVIATIONS * error
+        and reductions.mean() > MIN_STANDARD_ERRORS * error
     )
 
 
@@ -424,7 +431,7 @@ def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
 
     Args:
         fit: fit of a model to logs.
-        shares: output; receives the unexplained share of each log that the model explains poorly.
+        shares: filled with the unexplained share of each log that the model explains poorly.
     """
     unexplained: dict[str, str] = {}
     for index, log in enumerate(fit.logs):
@@ -448,13 +455,13 @@ def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
     if 1 < len(unexplained) == len(fit.logs):
         warnings.append(
             "the model does not explain any of the logs within the noise of their sensors: the"
-            f" mean residuals of the first log are {next(iter(unexplained.values()))}. Fit more"
-            " friction, or find out what else moved"
+            f" mean residuals of the first log are {next(iter(unexplained.values()))}. Choose a"
+            " richer friction model (--friction), or find out what else acted on the shaft"
         )
     else:
         warnings += [
             f"log {name}: mean residuals are {text}: the model does not explain the log. Leave it"
-            " out, find out what else moved, or fit more friction"
+            " out, find out what else acted on the shaft, or choose a richer friction model"
             for name, text in unexplained.items()
         ]
     values = np.array([start_fit.values for start_fit in fit.start_fits])
@@ -468,6 +475,7 @@ def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
             name for name, spread in zip(fit.model.names, spreads, strict=True) if spread > 0.2
         )
         warnings.append(
-            f"several minima: starts ended within 10 % of the best cost, but with different {names}"
+            "several minima: fits from different starts end within 10 % of the best cost, but"
+            f" differ in {names}"
         )
     return warnings

@@ -11,16 +11,16 @@ from codrl_mj.identify.log import SIGNALS, Log
 from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.result import predict
 
-# With fewer logs the improvement on the logs left out has no useful standard deviation.
+# With fewer logs, the standard error of the mean improvement would be meaningless.
 MIN_LOGS = 3
-"""Smallest number of moving logs for a cross-validation."""
+"""Minimum number of moving logs for a cross-validation."""
 _LOADED = {"coulomb": "load", "stribeck": "both"}
 """Friction model -> the same model with a gear efficiency."""
-# A gear efficiency is suggested only if it passes both limits.
+# A gear efficiency is suggested only if both conditions hold.
 _MAX_COST_RATIO = 0.9
-"""Largest ratio of costs with and without an efficiency, in total and in the median segment."""
+"""Largest ratio of the cost with an efficiency to that without, in sum and per median segment."""
 _MIN_DIFFERENCE = 0.05
-"""Smallest difference between the fitted efficiency and the known one."""
+"""Smallest difference between the fitted efficiency and its default."""
 
 
 class FrictionChoice(NamedTuple):
@@ -28,7 +28,7 @@ class FrictionChoice(NamedTuple):
 
     model: ShaftModel
     reason: str
-    """Reason of the choice; empty if the friction model was requested."""
+    """Reason for the choice; empty if the friction model was requested."""
 
 
 def choose_friction(
@@ -36,9 +36,10 @@ def choose_friction(
 ) -> FrictionChoice:
     """Return a shaft with the requested friction model or, for `auto`, with the best one.
 
-    `auto` leaves out one log at a time and predicts it from a fit to the others. A richer model
-    than viscous and Coulomb friction is chosen if it reduces the mean error by more than two
-    standard deviations of that mean. With fewer than three logs the model is `coulomb`.
+    `auto` leaves out one log at a time and predicts it from a fit to the others. It begins with
+    `coulomb`, and tries `load`, `stribeck` and `both`. A model replaces the best one so far if it
+    reduces the mean error by more than two standard errors. With fewer than three logs the model is
+    `coulomb`.
     """
     if friction != "auto":
         return FrictionChoice(dataclasses.replace(model, friction=friction), "")
@@ -46,8 +47,8 @@ def choose_friction(
         return FrictionChoice(
             model,
             f"friction: coulomb, because auto needs {MIN_LOGS} logs that move, and there"
-            f" {'is' if len(logs) == 1 else 'are'} {len(logs)}: it compares the errors on logs left"
-            " out. Add logs, or choose --friction load, stribeck or both",
+            f" {'is' if len(logs) == 1 else 'are'} {len(logs)}: it predicts each log by a fit to"
+            " the others. Add logs, or choose --friction load, stribeck or both",
         )
     errors = {"coulomb": _left_out_errors(model, logs, on_step)}
     best = model
@@ -60,8 +61,8 @@ def choose_friction(
     means = ", ".join(f"{name} {error.mean():.3g}" for name, error in errors.items())
     reason = (
         f"friction: {best.friction}, by the mean errors on the logs left out"
-        f" [{SIGNALS[model.output]}]: {means}; a richer one is taken if it is better by two"
-        " standard deviations"
+        f" [{SIGNALS[model.output]}]: {means}; a richer model is chosen only if it is better by two"
+        " standard errors"
     )
     return FrictionChoice(best, reason)
 
@@ -69,10 +70,10 @@ def choose_friction(
 def _left_out_errors(
     model: ShaftModel, logs: Sequence[Log], on_step: Callable[[], None]
 ) -> np.ndarray:
-    """Return the mean absolute error on each log of a fit to all other logs, shape (n,)."""
+    """Return the mean absolute error on each log, predicted by a fit to the others, shape (n,)."""
     segments = model.segments(logs)
     model, starts = model.initial_guess(segments)
-    # The fit to all logs is the start of each other fit, which then needs few evaluations.
+    # Each fit starts from the fit to all logs, and therefore needs few evaluations.
     values, errors = fit_from_starts(model, segments, starts[:2])[0].values, []
     for index, log in enumerate(logs):
         prediction = predict(
@@ -93,14 +94,14 @@ def load_hint(fit: Fit) -> str | None:
     loaded = dataclasses.replace(
         model, names=(*model.names, "gear_efficiency"), scales=np.append(model.scales, 0.1)
     )
-    known = model.defaults["gear_efficiency"]
-    richer = optimize(loaded, fit.segments, np.append(fit.values, min(known, 0.9)), 20, fit.scale)
+    default = model.defaults["gear_efficiency"]
+    richer = optimize(loaded, fit.segments, np.append(fit.values, min(default, 0.9)), 20, fit.scale)
     costs, reference = richer.costs(fit.scale), fit.costs(fit.scale)
     ratio = max(costs.sum() / reference.sum(), float(np.median(costs / reference)))
-    if abs(richer.values[-1] - known) <= _MIN_DIFFERENCE or ratio > _MAX_COST_RATIO:
+    if abs(richer.values[-1] - default) <= _MIN_DIFFERENCE or ratio > _MAX_COST_RATIO:
         return None
     return (
         f"friction grows with the load: an efficiency of {richer.values[-1]:.2g} instead of"
-        f" {known:.2g} would reduce the unexplained part by {1.0 - ratio:.0%}; fit it by --friction"
-        f" {_LOADED[model.friction]}"
+        f" {default:.2g} would reduce the residual cost by {1.0 - ratio:.0%}; fit it with"
+        f" --friction {_LOADED[model.friction]}"
     )

@@ -68,11 +68,11 @@ def identify(
             known, and then means a pendulum.
         known: values of parameters that are not fitted, by names of `PARAMETERS`.
         friction: `coulomb` (viscous and Coulomb), `stribeck`, `load`, `both`, or `auto`, which
-            chooses the model with the best predictions of logs that are left out of the fit.
+            chooses a model by cross-validation; see `choose_friction`.
         held_out: logs that are predicted, but not fitted.
         estimated: parameters to fit that otherwise have a default, such as `torque_gain`.
-        segment: duration [s] of the segments in which the shaft is simulated, >= 0.05: short if
-            the shaft is unstable, 1 or 2 s if it only sticks and slides.
+        segment: duration [s] of the segments in which the shaft is simulated, >= 0.05. Unstable
+            shafts need short segments; a shaft that only sticks and slides needs 1 or 2 s.
         base: mapping of a drive, which supplies the parameters that the logs do not determine, and
             the gear ratio if it is not in `known`.
         on_progress: called with the name of the task, the steps done and the number of steps.
@@ -82,7 +82,7 @@ def identify(
         ValueError: a name is unknown, a value is out of bounds, or the logs lack signals; the
             message names the missing signals.
     """
-    logs, held_out, repeated = separate_logs(logs, held_out)
+    logs, held_out, duplicate_notes = separate_logs(logs, held_out)
     fixed, motor = (
         check_arguments(logs, rig, known or {}, friction, estimated, segment, base),
         base_motor(base),
@@ -154,12 +154,12 @@ def identify(
         friction_reason=choice.reason if driven_by else "",
     )
     if _may_need_voltage(identified, moving):
-        # If a time constant of the winding has only few rows, the logged current may not determine
-        # the back-EMF constant. A fit with the voltage as the input may still determine it.
+        # If only a few rows fall within the winding's time constant, the logged current may not
+        # determine the back-EMF constant. A fit with the voltage as the input may still do so.
         without_current = [_without_current(log) for log in logs]
         arguments = rig, known, friction, held_out, estimated, segment, base, on_progress, seed
         identified = _better_identified(identified, identify(without_current, *arguments))
-    return dataclasses.replace(identified, warnings=(*repeated, *identified.warnings))
+    return dataclasses.replace(identified, warnings=(*duplicate_notes, *identified.warnings))
 
 
 def _may_need_voltage(identified: Identified, moving: Sequence[Log]) -> bool:
@@ -178,36 +178,40 @@ def _without_current(log: Log) -> Log:
     return dataclasses.replace(log, signals=signals) if has_motion(log) else log
 
 
-def _better_identified(under_current: Identified, under_voltage: Identified) -> Identified:
-    """Join the winding fitted under the current and the shaft of the fit with fewer refusals."""
+def _better_identified(with_current: Identified, with_voltage: Identified) -> Identified:
+    """Return the result with the current, or with the shaft that was fitted with the voltage.
+
+    The shaft of the fit with the voltage is taken if fewer of its parameters are refused.
+    """
     refused = [
         sum(
             estimate.status not in USABLE and estimate.name != "inductance"
             for estimate in result.estimates
         )
-        for result in (under_current, under_voltage)
+        for result in (with_current, with_voltage)
     ]
     if refused[1] >= refused[0]:
-        return under_current
+        return with_current
     estimates = {
-        estimate.name: estimate for estimate in (*under_current.estimates, *under_voltage.estimates)
+        estimate.name: estimate for estimate in (*with_current.estimates, *with_voltage.estimates)
     }
     note = (
-        "the shaft is fitted under the voltage: under the current its back-EMF constant was refused"
+        "the shaft is fitted with the voltage as its input, because with the current its back-EMF"
+        " constant was refused"
     )
     return dataclasses.replace(
-        under_voltage,
-        delays={**under_current.delays, **under_voltage.delays},
+        with_voltage,
+        delays={**with_current.delays, **with_voltage.delays},
         estimates=tuple(estimates[name] for name in PARAMETERS if name in estimates),
-        warnings=(note, *under_voltage.warnings),
-        friction_reason=under_current.friction_reason,
+        warnings=(note, *with_voltage.warnings),
+        friction_reason=with_current.friction_reason,
         traces=(
-            *(trace for trace in under_current.traces if trace.part == "winding"),
-            *(trace for trace in under_voltage.traces if trace.part == "shaft"),
+            *(trace for trace in with_current.traces if trace.part == "winding"),
+            *(trace for trace in with_voltage.traces if trace.part == "shaft"),
         ),
         correlations={
-            "winding": under_current.correlations["winding"],
-            "shaft": under_voltage.correlations["shaft"],
+            "winding": with_current.correlations["winding"],
+            "shaft": with_voltage.correlations["shaft"],
         },
     )
 
@@ -215,8 +219,8 @@ def _better_identified(under_current: Identified, under_voltage: Identified) -> 
 def _with_winding(shaft: ShaftModel, winding: Fit | None) -> ShaftModel:
     """Return a shaft with the parameter of the fitted winding that it needs, unless it is known.
 
-    A shaft under a current needs the back-EMF constant, which equals the torque constant except for
-    losses. A shaft under a voltage needs the resistance.
+    A shaft that is driven by a current needs the torque constant, which equals the winding's
+    back-EMF constant except for losses. A shaft that is driven by a voltage needs the resistance.
     """
     parameters = shaft.known if winding is None else winding.model.all_values(winding.values)
     name, source = WINDING_SOURCES.get(shaft.driven_by, ("", ""))
@@ -229,14 +233,14 @@ def _with_winding(shaft: ShaftModel, winding: Fit | None) -> ShaftModel:
 def separate_logs(
     logs: Sequence[Log], held_out: Sequence[Log]
 ) -> tuple[list[Log], list[Log], list[str]]:
-    """Return the logs to fit and held out without duplicates, and a note on each duplicate.
+    """Return the fitted and the held-out logs without duplicates, and a note on each duplicate.
 
     Duplicates are recognized by their content, because copies may have other names. A log that is
     both fitted and held out is only held out.
     """
     fitted: dict[bytes, Log] = {}
     predicted: dict[bytes, Log] = {}
-    repeated = []
+    notes = []
     for candidates, unique in ((held_out, predicted), (logs, fitted)):
         for log in candidates:
             key = _digest(log)
@@ -251,18 +255,18 @@ def separate_logs(
                 if is_predicted
                 else f"there twice{copy}: it counts once"
             )
-            repeated.append(f"log {log.name} is {note}")
+            notes.append(f"log {log.name} is {note}")
     if logs and not fitted:
         raise ValueError(
             f"logs {', '.join(log.name for log in logs)}: all of them are also held out, which"
             " leaves none to fit; hold out other logs (--holdout on the command line, held_out= in"
             " Python)"
         )
-    return [*fitted.values()], [*predicted.values()], repeated
+    return [*fitted.values()], [*predicted.values()], notes
 
 
 def _digest(log: Log) -> bytes:
-    """Return a digest of a log's signals, which does not depend on its name or times."""
+    """Return a digest of the signals of a log; its name and its times are ignored."""
     digest = hashlib.sha256()
     for name in sorted(log.signals):
         digest.update(name.encode() + log.signals[name].tobytes())
@@ -270,9 +274,9 @@ def _digest(log: Log) -> bytes:
 
 
 def _contradictions(estimates: Sequence[Estimate], motor: Any) -> list[str]:
-    """Return a warning if the datasheet's rotor is heavier than all that moves in the logs.
+    """Return a warning if the rotor inertia of the datasheet exceeds the total identified inertia.
 
-    The datasheet's rotor inertia is used if the inertia of the load is not known.
+    The datasheet's rotor inertia is used only if the logs and known values do not determine it.
     """
     by_name = {estimate.name: estimate for estimate in estimates}
     if motor is None or "rotor_inertia" in by_name or "inertia" not in by_name:
@@ -282,8 +286,8 @@ def _contradictions(estimates: Sequence[Estimate], motor: Any) -> list[str]:
         return []
     return [
         f"the motor's rotor_inertia = {motor.rotor_inertia:.4g} kg*m^2 is {reflected:.4g} kg*m^2 at"
-        f" the output, more than the {total.value:.4g} kg*m^2 of all that moves: fit it by --known"
-        " load_inertia=VALUE, or correct the --motor"
+        f" the output, more than the total of {total.value:.4g} kg*m^2 in the logs: fit it with"
+        " --known load_inertia=VALUE, or correct --motor"
     ]
 
 
@@ -298,7 +302,7 @@ def check_arguments(
 ) -> dict[str, float]:
     """Validate the arguments of `identify`, and return the known parameters and gear ratio."""
     motor = base_motor(base)
-    # Without the gear ratio, the fitted parameters of the motor would refer to the output.
+    # Without the gear ratio of the base, fitted motor parameters would be values at the output.
     ratio = 1.0 if motor is None else motor.gear_ratio
     known = {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **(known or {})}
     _, moving, driven_by, output = assign_logs(logs)
@@ -334,7 +338,9 @@ def check_arguments(
         )
     possible = [name for name, only in ESTIMABLE.items() if only is None or only == driven_by]
     if driven_by is not None or estimated:
-        check_names(estimated, possible, f"parameter of a shaft under a {driven_by}", "estimated.")
+        check_names(
+            estimated, possible, f"parameter of a shaft driven by a {driven_by}", "estimated."
+        )
     if moving and not output:
         motions = "; ".join(
             f"{log.name}: {'position' if log.has('position') else 'velocity'}" for log in moving
@@ -346,7 +352,7 @@ def check_arguments(
     if rig is None and "mgl" not in known and driven_by is not None:
         raise ValueError(
             "rig is not given (--rig on the command line, rig= in Python): it decides which"
-            " parameters are fitted, must be pendulum, free or load; a motor without a load is"
+            " parameters are fitted, and must be pendulum, free or load; a motor without a load is"
             " free, with load_inertia=0 known"
         )
     return {name: float(value) for name, value in known.items()}
@@ -357,7 +363,7 @@ def predict_missing(
 ) -> str | None:
     """Return a message on actuator parameters that these logs cannot determine, or None.
 
-    Only the signals of the logs are considered, so that no fit is needed.
+    Only the presence of signals and of a motion is considered, so that no fit is needed.
     """
     electrical, moving, driven_by, _ = assign_logs(logs)
     names = {*known, *(("resistance", "inductance") if electrical else ())}

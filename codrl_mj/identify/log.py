@@ -1,4 +1,4 @@
-"""Bench logs in SI units, estimates of sensor noise and motion, and cutting into segments."""
+"""Bench logs in SI units: their quality, the requirements of a fit, and the cut into segments."""
 
 import dataclasses
 import itertools
@@ -69,7 +69,7 @@ class Log:
     constants: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Numbers that the file states for the whole log, such as `kp` or `mass`."""
     rows: np.ndarray | None = None
-    """Number in the file of each row, shape (n,), from 1; None: all rows, in order."""
+    """Row numbers in the file, shape (n,), from 1; None: all rows, in order."""
     findings: tuple[Finding, ...] = ()
     """Findings from reading the file."""
 
@@ -118,7 +118,7 @@ class Log:
 
     @property
     def row_numbers(self) -> np.ndarray:
-        """Number in the file of each row, shape (n,), from 1."""
+        """Row numbers in the file, shape (n,), from 1."""
         return np.arange(1, len(self.time) + 1) if self.rows is None else self.rows
 
     @property
@@ -130,8 +130,7 @@ class Log:
 def gapless_stretches(log: Log) -> list[slice]:
     """Return the stretches of a log without gaps, each of at least two rows.
 
-    The time steps within a stretch differ if single rows were dropped: a simulation must use the
-    time stamps.
+    Single rows may be missing within a stretch, so that a simulation has to use the time stamps.
     """
     gaps = np.flatnonzero(np.diff(log.time) > GAP_STEPS * log.step) + 1
     edges = [0, *map(int, gaps), len(log.time)]
@@ -147,7 +146,7 @@ def find_resolution(values: np.ndarray) -> float:
     # One or two levels do not show whether they lie on a grid.
     if steps.size < 2:
         return 0.0
-    # The file may round values, which makes equal steps slightly different: their mean is better.
+    # Rounding in the file makes equal steps slightly different, so that their mean is taken.
     min_step = float(steps.min())
     min_step = float(steps[steps < 1.2 * min_step].mean())
     # Neighboring levels may be missing, so that the smallest step may be two or three grid steps.
@@ -160,9 +159,10 @@ def find_resolution(values: np.ndarray) -> float:
 
 
 def find_turn_jumps(values: np.ndarray, period: float) -> np.ndarray:
-    """Return the rows after which an angle jumps by a turn, which is `period` in its unit.
+    """Return the rows after which an angle jumps by a full turn, `period` in the angle's unit.
 
-    The result is empty if over a fifth of the steps exceed a quarter turn: then the shaft is fast.
+    The result is empty if over a fifth of the steps exceed a quarter turn, because the shaft then
+    turns too fast to tell.
     """
     steps = np.abs(np.diff(values))
     jumps = np.flatnonzero(np.abs(steps - period) < 0.1 * period)
@@ -170,7 +170,7 @@ def find_turn_jumps(values: np.ndarray, period: float) -> np.ndarray:
 
 
 def counts_per_turn(step: float, period: float) -> int | None:
-    """Return an encoder's counts per turn; None if its step may as well be a file's rounding."""
+    """Return an encoder's counts per turn; None if the step may come from rounding in the file."""
     if step <= 0.0 or round(step / 10.0 ** math.floor(math.log10(step)), 5) in _ROUND_DIGITS:
         return None
     count = round(period / step)
@@ -192,18 +192,18 @@ def is_supply_voltage(volts: np.ndarray, responses: Sequence[np.ndarray]) -> boo
 # -- requirements of a fit ------------------------------------------------------------------------
 
 INPUTS = ("torque", "current", "voltage")
-"""Possible inputs of a shaft, the nearest to it first."""
+"""Possible inputs of a shaft, in order of preference."""
 OUTPUTS = "position", "velocity"
-"""Signals that a simulated shaft is compared with, the preferred one first."""
-# Rows that are farther apart hold too little information within the predicted time.
+"""Signals that a simulated shaft is compared with, in order of preference."""
+# Rows that are farther apart contain too little information within a segment.
 MAX_STEP = 0.05
-"""Longest usual time step of a log [s]."""
-# A shaft has up to five parameters and two states.
+"""Longest median time step of a log [s]."""
+# Fewer rows cannot determine the parameters and the two initial states of a shaft.
 MIN_ROWS = 20
-"""Smallest number of rows in the longest stretch without a gap."""
-# The first 0.03 s determine only the initial state.
+"""Minimum number of rows in the longest stretch without a gap."""
+# In a prediction, the first 0.03 s determine only the initial state.
 MIN_DURATION = 0.04
-"""Shortest duration [s] of that stretch, if the shaft moves."""
+"""Shortest duration [s] of the longest stretch without a gap, if the shaft moves."""
 
 
 class LogRoles(NamedTuple):
@@ -230,7 +230,7 @@ def assign_logs(logs: Sequence[Log]) -> LogRoles:
 
 
 def find_obstacle(logs: Sequence[Log]) -> Finding | None:
-    """Return the reason for which logs cannot be fitted together; None if they can.
+    """Return the reason why logs cannot be fitted together; None if they can.
 
     `check` reports it as a finding, `identify` as an error.
     """
@@ -267,7 +267,7 @@ def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
     """Return a finding that names the signals that a fit lacks, and how to get them."""
     signals = set().union(*(log.signals for log in logs))
     if not signals & {*INPUTS}:
-        # The command of a servo is not an input of the shaft; its duty is one.
+        # The command of a servo is not an input of the shaft, but its duty gives the voltage.
         lacking, remedy = "no voltage, current or torque", "log one of them"
         if "duty" in signals:
             remedy = (
@@ -276,18 +276,18 @@ def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
             )
         elif "command" in signals:
             remedy += (
-                "; of a servo also the duty (Feetech: Present Load, Dynamixel: Present PWM) and the"
-                " input voltage"
+                "; for a servo, log the duty (Feetech: Present Load, Dynamixel: Present PWM) and"
+                " the input voltage"
             )
     elif is_moving:
         lacking, remedy = (
-            "no torque, current or voltage in all logs that move",
+            "no torque, current or voltage that all moving logs have",
             "fit logs with the same signals together",
         )
     else:
         lacking, remedy = (
-            "no position or velocity that moves",
-            "log the motion, or both voltage and current",
+            "no position or velocity that changes",
+            "log a motion, or both voltage and current",
         )
     subject, pronoun = ("this log has", "it") if len(logs) == 1 else ("these logs have", "them")
     return Finding(
@@ -301,33 +301,32 @@ def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
 
 # -- segments, each simulated from its own initial state ------------------------------------------
 
-# A longer simulation accumulates the effect of friction that no model describes, and its cost has
-# several minima.
+# Over a longer simulation the errors of the friction model accumulate, and the cost has several
+# minima.
 SEGMENT_DURATION = 0.5
 """Duration [s] of the segments of a shaft."""
 # Residuals within a block are correlated: resampling single rows would make intervals too narrow.
 BLOCK_DURATION = 1.0
-"""Shortest stretch [s] of a log that is resampled as a whole."""
+"""Shortest duration [s] of a block, which is a stretch of a log that is resampled as a whole."""
 # The shaft is slower than the winding. Combined rows have the mean of their inputs and the position
 # of the first row.
 SHAFT_STEP = 5e-4
 """Shortest time step [s] of a shaft's segments; rows that are closer are combined."""
 SPIKE_FACTOR = 50.0
-"""Smallest deviation of a spike from its neighbors, over the 90th percentile of all rows."""
-# The window is short compared with the motion of a shaft, and long compared with the steps of an
-# encoder.
+"""Smallest deviation of a spike, over the 90th percentile of the deviations of all rows."""
+# The window is shorter than the motions of a shaft, and longer than the steps of an encoder take.
 SMOOTHING_WINDOW = 4e-3
 """Duration [s] that positions are smoothed over."""
 MIN_MOTION_STEPS = 10.0
-"""Steps of its encoder that a shaft has to move by; otherwise it counts as locked."""
+"""Motion in encoder steps below which a shaft counts as locked."""
 
 
 class Segment(NamedTuple):
     """Rows of a log that are simulated from one initial state."""
 
     log: int  # index of the log among the fitted logs
-    block: int  # number of the block that it is resampled with, unique over all logs
-    rows: slice  # of the log
+    block: int  # number of its block, unique over all logs; blocks are resampled as a whole
+    rows: slice  # rows of the log
     times: np.ndarray  # [s], shape (m,)
     inputs: np.ndarray  # input at the times, shape (m,)
     slopes: np.ndarray  # rate of change of the input until the next row [1/s], shape (m,)
@@ -337,7 +336,7 @@ class Segment(NamedTuple):
     state: np.ndarray  # initial guess of the state at the first row
 
     def first(self, count: int) -> "Segment":
-        """Return a segment of the first rows."""
+        """Return a segment of the first `count` rows."""
         arrays = ("times", "inputs", "slopes", "speeds", "measured")
         return self._replace(**{name: getattr(self, name)[:count] for name in arrays})
 
@@ -395,7 +394,7 @@ def sensor_deviation(log: Log, name: str) -> float:
 def has_motion(log: Log) -> bool:
     """Return True if the shaft moves by more than the noise of its position or velocity.
 
-    Without a position or a velocity it counts as locked.
+    Without a logged position or velocity the shaft counts as locked.
     """
     if log.has("position"):
         return float(np.ptp(log.signals["position"])) > max(
@@ -440,9 +439,9 @@ def smoothed_speeds(
 
 
 def cut_segments(log: Log, duration: float) -> list[slice]:
-    """Return the rows of segments of about a duration [s], none of which has a gap.
+    """Cut a log into segments without gaps, each of about a duration [s]; return their rows.
 
-    Each stretch is divided evenly, so that a segment may be up to half longer than the duration.
+    Each stretch is divided evenly, so that a segment may be up to 1.5 times as long.
     """
     segments = []
     for stretch in gapless_stretches(log):

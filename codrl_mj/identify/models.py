@@ -1,4 +1,4 @@
-"""Models of a winding and a shaft for the estimator, with initial guesses from regressions."""
+"""Models of a winding and of a shaft that are fitted, with initial guesses from regressions."""
 
 import dataclasses
 import functools
@@ -40,7 +40,7 @@ class WindingModel(Model):
     driven_by: str = "voltage"
     output: str = "current"
     shaft: Any = None
-    """`Fit` of the shaft under the current, which gives the speed between the rows; None: none."""
+    """`Fit` of a shaft driven by the current, to compute the speed between rows; None: not used."""
 
     steps: ClassVar = np.array([1e-3])
 
@@ -50,7 +50,8 @@ class WindingModel(Model):
 
         parameters = self.all_values(values)
         resistance, inductance = parameters["resistance"], parameters["inductance"]
-        constant = parameters.get("back_emf_constant", 0.0) * parameters["gear_ratio"]
+        # The speeds of segments are those of the output.
+        back_emf_constant = parameters.get("back_emf_constant", 0.0) * parameters["gear_ratio"]
         return lambda segment, state: simulate_winding(
             segment.times,
             segment.inputs,
@@ -58,7 +59,7 @@ class WindingModel(Model):
             state[0],
             resistance,
             inductance,
-            constant,
+            back_emf_constant,
         )
 
     def segments(
@@ -71,17 +72,18 @@ class WindingModel(Model):
             speed = self._mean_speeds(log) if speeds is None else speeds[index]
             for rows in cut_segments(log, BLOCK_DURATION):
                 times, current = log.time[rows], log.signals["current"][rows]
-                drive = times, volts[rows], np.zeros(len(times)), speed[rows]
+                arrays = times, volts[rows], np.zeros(len(times)), speed[rows]
                 segments.append(
-                    Segment(index, len(segments), rows, *drive, current, deviation, current[:1])
+                    Segment(index, len(segments), rows, *arrays, current, deviation, current[:1])
                 )
         return segments
 
     def initial_guess(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
-        """Return the model with its free parameters, and guesses from regressions.
+        """Return the model with its free parameters set, and initial guesses from regressions.
 
         The integral of the voltage over a window is R times the integral of the current, plus L
-        times its change, plus kE times the angle turned. Each guess uses another length of window.
+        times the change of the current, plus kE times the change of the angle. Each guess uses
+        another window length.
         """
         moving = any(np.any(segment.speeds) for segment in segments)
         free = tuple(
@@ -102,16 +104,16 @@ class WindingModel(Model):
                 )
                 edges = np.arange(0, len(current), min(count, len(current) - 1))
                 rates = 0.5 * (current[1:] + current[:-1]), speeds, segment.inputs[:-1]
-                charge, turn, flux = (
+                charge, angle, flux = (
                     np.diff(np.append(0.0, np.cumsum(rate * steps))[edges]) for rate in rates
                 )
-                rows.append(np.stack([charge, np.diff(current[edges]), turn, flux], axis=1))
+                rows.append(np.stack([charge, np.diff(current[edges]), angle, flux], axis=1))
             table = np.concatenate(rows)
             starts.append(_regress_free(table[:, :3], table[:, 3], ELECTRICAL, free, fixed))
         magnitudes = np.abs(np.median(starts, axis=0))
         volts = np.concatenate([segment.inputs for segment in segments])
         amperes = np.concatenate([segment.measured for segment in segments])
-        # Values of a regression that are near 0 or negative are replaced by rough magnitudes.
+        # Regression results that are near 0 or negative are replaced by rough magnitudes.
         fallback = {
             "resistance": np.std(volts) / max(np.std(amperes), 1e-9) + 1e-6,
             "inductance": 1e-4,
@@ -123,9 +125,9 @@ class WindingModel(Model):
         return dataclasses.replace(self, names=free, scales=scales), starts
 
     def _mean_speeds(self, log: Log) -> np.ndarray:
-        """Return the mean speeds until the next row, shape (n,), 0 if locked.
+        """Return the mean speed [rad/s] from each row to the next, shape (n,); 0 if locked.
 
-        They are the slopes of smoothed positions. With a fitted shaft they are the speeds of its
+        The speeds are slopes of smoothed positions. With a fitted shaft, they are the speeds of its
         simulation plus the slopes of the smoothed residuals.
         """
         speeds, shaft = np.zeros(len(log.time)), self.shaft
@@ -174,18 +176,18 @@ def _regress_free(
 class ShaftModel(Model):
     """Shaft with inertia, gravity, load and friction, driven by a torque, a current or a voltage.
 
-    If it is driven by a voltage, the current is quasi-static, and kE equals kT unless it is known.
+    With a voltage as input, the current is quasi-static, and kE equals kT unless kE is known.
     """
 
-    rig: str
-    friction: str
+    rig: str  # load at the output, a key of `RIG_PARAMETERS`
+    friction: str  # friction model, a key of `FRICTION_PARAMETERS`
     estimated: tuple[str, ...] = ()  # additional free parameters
     segment: float = SEGMENT_DURATION  # duration [s] of a segment
 
     steps: ClassVar = np.array([1e-4, 1e-3])
 
     def shaft_parameters(self, values: np.ndarray) -> Any:
-        """Return the `ShaftParameters` of a simulation with free parameters (p,)."""
+        """Return the `ShaftParameters` for a simulation, from free parameters of shape (p,)."""
         from codrl_mj.identify.simulation import shaft_parameters
 
         parameters = self.all_values(values)
@@ -201,7 +203,7 @@ class ShaftModel(Model):
         return shaft_parameters(parameters, gain, braking)
 
     def simulator(self, values: np.ndarray) -> Simulate:
-        """Return a function that simulates positions [rad] or speeds [rad/s] of a segment."""
+        """Return a function that simulates the positions [rad] or speeds [rad/s] of a segment."""
         from codrl_mj.identify.simulation import simulate_shaft
 
         shaft, output_index = self.shaft_parameters(values), int(self.output == "velocity")
@@ -217,8 +219,8 @@ class ShaftModel(Model):
         driven_by, output, block = self.driven_by, self.output, -1
         for index, log in enumerate(logs):
             inputs = log.signals[driven_by]
-            # Single-row peaks of a voltage may be real, for example in a PRBS with a fast clock;
-            # those of a sensor are outliers.
+            # A peak of a single row may be real in a voltage, for example in a PRBS with a fast
+            # clock, but is an outlier in a measured signal.
             if driven_by != "voltage":
                 inputs = remove_spikes(inputs)
             measured, deviation = log.signals[output], sensor_deviation(log, output)
@@ -261,7 +263,10 @@ class ShaftModel(Model):
         return segments
 
     def initial_guess(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
-        """Return the model with its free parameters, and guesses by regressions and around them."""
+        """Return the model with its free parameters set, and initial guesses from regressions.
+
+        Two random variations of the first guess are added.
+        """
         driven_by, known = self.driven_by, self.known
         names = [*RIG_PARAMETERS[self.rig], *FRICTION_PARAMETERS[self.friction], *self.estimated]
         if driven_by != "torque":
@@ -271,9 +276,11 @@ class ShaftModel(Model):
         free = tuple(name for name in dict.fromkeys(names) if name not in known)
         guesses = []
         for window in (0.02, 0.004):
-            factors, drive, speed = _shaft_regression(segments, self.rig, self.output, window)
+            coefficients, drive, speed = _shaft_regression(segments, self.rig, self.output, window)
             guesses.append(
-                _shaft_start(factors, drive, speed, driven_by, {**self.defaults, **known}, known)
+                _guess_shaft(
+                    coefficients, drive, speed, driven_by, {**self.defaults, **known}, known
+                )
             )
         start, floors = guesses[0]
         scales = np.array(
@@ -294,8 +301,8 @@ class ShaftModel(Model):
         return dataclasses.replace(self, names=free, scales=scales), starts
 
 
-def _shaft_start(
-    factors: Mapping[str, float],
+def _guess_shaft(
+    coefficients: Mapping[str, float],
     drive: float,
     speed: float,
     driven_by: str,
@@ -305,45 +312,48 @@ def _shaft_start(
     """Return guesses of all parameters of a shaft, and lower limits for the scales of some.
 
     Args:
-        factors: coefficients of the regression of the input.
-        drive: root mean square of the input.
-        speed: root mean square of the speed [rad/s].
+        coefficients: result of `_shaft_regression`.
+        drive: RMS of the input.
+        speed: RMS of the speed [rad/s].
         driven_by: `torque`, `current` or `voltage`.
         fixed: known parameters and defaults.
         known: known parameters.
     """
     ratio = fixed["gear_ratio"]
-    # The gain is the torque at the output over the input.
+    # The gain is the ratio of the output torque to the input.
     gain, braking, resistance = fixed["torque_gain"], 0.0, fixed.get("resistance", 1.0)
     if driven_by != "torque":
-        gain = fixed.get("torque_constant", _input_gain(factors, known) / ratio) * ratio
+        gain = fixed.get("torque_constant", _torque_per_input(coefficients, known) / ratio) * ratio
     start = dict(fixed)
     if driven_by == "voltage":
         if "torque_constant" in known or "resistance" in known:
-            per_volt = _input_gain(
-                factors, known, gain / resistance if "torque_constant" in known else gain
+            torque_per_volt = _torque_per_input(
+                coefficients, known, gain / resistance if "torque_constant" in known else gain
             )
-            resistance = resistance if "resistance" in known else gain / max(per_volt, 1e-9)
-        # Without a known constant the viscous term counts entirely as back-EMF.
+            resistance = resistance if "resistance" in known else gain / max(torque_per_volt, 1e-9)
+        # Without a known constant or resistance, the viscous term is attributed to back-EMF alone.
         else:
-            per_volt = gain
-            resistance = (max(factors["viscous"], 0.0) + 1e-6) / max(per_volt, 1e-9)
-        start["torque_constant"] = fixed.get("torque_constant", per_volt * resistance / ratio)
+            torque_per_volt = gain
+            resistance = (max(coefficients["viscous"], 0.0) + 1e-6) / max(torque_per_volt, 1e-9)
+        start["torque_constant"] = fixed.get(
+            "torque_constant", torque_per_volt * resistance / ratio
+        )
         start["resistance"] = resistance
         start["back_emf_constant"] = fixed.get("back_emf_constant", start["torque_constant"])
-        braking = per_volt * ratio * start["back_emf_constant"]
-        gain = per_volt
+        braking = torque_per_volt * ratio * start["back_emf_constant"]
+        gain = torque_per_volt
     else:
         start["torque_constant"] = gain / ratio
-    # Without an input, as in a free swing, gravity or a known load sets the scale of the torques.
+    # If the input is nearly 0, as in a free swing, a known gravity or load gives the scale of the
+    # torques.
     load = max(known.get("mgl", 0.0), abs(known.get("constant_torque", 0.0)))
     torque = max(drive * gain if drive * gain > 1e-3 * load else load, 1e-9)
     start |= {
-        "inertia": factors["inertia"] * gain,
-        "mgl": factors["mgl"] * gain,
-        "constant_torque": factors["constant_torque"] * gain,
-        "coulomb_friction": factors["coulomb"] * gain / ratio,
-        "viscous_friction": (factors["viscous"] * gain - braking) / ratio**2,
+        "inertia": coefficients["inertia"] * gain,
+        "mgl": coefficients["mgl"] * gain,
+        "constant_torque": coefficients["constant_torque"] * gain,
+        "coulomb_friction": coefficients["coulomb"] * gain / ratio,
+        "viscous_friction": (coefficients["viscous"] * gain - braking) / ratio**2,
         "gear_efficiency": 0.9,
         "stribeck_friction": 0.05 * torque / ratio,
         "stribeck_speed": 0.1 * speed * ratio,
@@ -360,13 +370,13 @@ def _shaft_start(
     return start, floors
 
 
-def _input_gain(
-    factors: Mapping[str, float], known: Mapping[str, float], default: float = 1.0
+def _torque_per_input(
+    coefficients: Mapping[str, float], known: Mapping[str, float], default: float = 1.0
 ) -> float:
-    """Return the torque at the output over the input, from a known torque or inertia."""
+    """Return the ratio of the output torque to the input, from a known torque or inertia."""
     for name in ("mgl", "constant_torque", "inertia"):
-        if known.get(name, 0.0) != 0.0 and factors[name] > 0.0:
-            return known[name] / factors[name]
+        if known.get(name, 0.0) != 0.0 and coefficients[name] > 0.0:
+            return known[name] / coefficients[name]
     return default
 
 
@@ -375,6 +385,8 @@ def _shaft_regression(
 ) -> tuple[dict[str, float], float, float]:
     """Regress the integral of the input on the integrals of the shaft's torques.
 
+    The coefficients are divided by the unknown torque per input.
+
     Args:
         segments: segments of the shaft's logs.
         rig: `pendulum`, `free` or `load`.
@@ -382,7 +394,7 @@ def _shaft_regression(
         window: duration [s] that positions are smoothed over.
 
     Returns:
-        The coefficients, and the root mean squares of the input and of the speed [rad/s].
+        The coefficients by name, and the RMS of the input and of the speed [rad/s].
     """
     from scipy.integrate import cumulative_trapezoid
 
@@ -410,7 +422,7 @@ def _shaft_regression(
             segment.inputs,
         )
         integrals = [integrate(column, times) for column in columns]
-        # Over 2.5 smoothing windows the errors of the smoothed speeds are small against the change.
+        # Over 2.5 smoothing windows, the speed changes by much more than its error.
         edges = np.searchsorted(times, np.arange(times[0], times[-1] + 1e-9, 2.5 * window))
         edges = np.unique(np.minimum(edges, len(times) - 1))
         rows.append(
@@ -429,6 +441,6 @@ def _shaft_regression(
         if name not in ("mgl", "constant_torque") or name in RIG_PARAMETERS[rig]
     ]
     solution = _regress_free(table[:, :5], table[:, 5], names, free, dict.fromkeys(names, 0.0))
-    factors = dict.fromkeys(names, 0.0) | dict(zip(free, map(float, solution), strict=True))
-    size = float(np.sqrt(np.mean(np.concatenate(inputs) ** 2)))
-    return factors, size, float(np.sqrt(np.mean(np.concatenate(all_speeds) ** 2)))
+    coefficients = dict.fromkeys(names, 0.0) | dict(zip(free, map(float, solution), strict=True))
+    input_rms = float(np.sqrt(np.mean(np.concatenate(inputs) ** 2)))
+    return coefficients, input_rms, float(np.sqrt(np.mean(np.concatenate(all_speeds) ** 2)))

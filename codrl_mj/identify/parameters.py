@@ -13,7 +13,7 @@ class Parameter(NamedTuple):
     lower: float
     upper: float
     description: str
-    default: float | None = None  # value if it is neither fitted nor known; None: none
+    default: float | None = None  # value if neither fitted nor known; None: no default
 
 
 PARAMETERS = {
@@ -22,15 +22,15 @@ PARAMETERS = {
     "back_emf_constant": Parameter("V*s/rad", 1e-6, 1e3, "back-EMF constant at the rotor"),
     "torque_constant": Parameter("N*m/A", 1e-6, 1e3, "torque constant at the rotor"),
     "torque_gain": Parameter("", 1e-2, 1e2, "true torque over the logged torque", 1.0),
-    "inertia": Parameter("kg*m^2", 1e-9, 1e4, "inertia of all that moves, at the output"),
-    "mgl": Parameter("N*m", 0.0, 1e4, "largest torque of gravity, at the output", 0.0),
+    "inertia": Parameter("kg*m^2", 1e-9, 1e4, "total moving inertia, at the output"),
+    "mgl": Parameter("N*m", 0.0, 1e4, "largest gravity torque, m*g*l, at the output", 0.0),
     "constant_torque": Parameter(
-        "N*m", -1e4, 1e4, "constant load torque against positive speeds, at the output", 0.0
+        "N*m", -1e4, 1e4, "constant load torque that opposes positive speeds, at the output", 0.0
     ),
     "coulomb_friction": Parameter("N*m", 0.0, 1e3, "Coulomb friction at the rotor"),
     "viscous_friction": Parameter("N*m*s/rad", 0.0, 1e3, "viscous friction at the rotor"),
     "friction_torque": Parameter(
-        "N*m", 0.0, 1e3, "total friction at the speed of the logs, at the rotor"
+        "N*m", 0.0, 1e3, "total friction torque at the RMS speed of the logs, at the rotor"
     ),
     "gear_efficiency": Parameter("", 0.3, 1.0, "share of the torque that the gear passes on", 1.0),
     "stribeck_friction": Parameter(
@@ -43,7 +43,7 @@ PARAMETERS = {
     "load_inertia": Parameter("kg*m^2", 0.0, 1e4, "inertia at the output without the motor's"),
     "gear_ratio": Parameter("", 1e-3, 1e5, "turns of the rotor per turn of the output", 1.0),
 }
-"""All parameters; each can be given as known, except `friction_torque`, which is a sum."""
+"""All parameters. Each can be known in advance, except `friction_torque`, which is derived."""
 ELECTRICAL = ("resistance", "inductance", "back_emf_constant")
 FRICTION = (
     "coulomb_friction",
@@ -52,9 +52,10 @@ FRICTION = (
     "gear_efficiency",
     "friction_torque",
 )
-"""Parameters whose true value may be 0 (of an efficiency: 1).
+"""Friction parameters, whose true value may be 0, or 1 for `gear_efficiency`.
 
-Their intervals are judged by their share of the torque, because a relative error has no meaning.
+Their intervals are judged relative to the total friction, because a relative error is meaningless
+for a value near 0.
 """
 MOTOR_PARAMETERS = (
     *(
@@ -75,12 +76,12 @@ MOTOR_PARAMETERS = (
 )
 """Fields of `GearMotor` that are identified or known."""
 LOSS_PARAMETERS = ("gear_efficiency", "stribeck_friction", "stribeck_speed", "stribeck_exponent")
-"""Fields of `GearMotor` that a shaft takes from a base if they are neither fitted nor known."""
+"""Fields of `GearMotor` that the base drive supplies if they are neither fitted nor known."""
 WINDING_SOURCES = {
     "current": ("torque_constant", "back_emf_constant"),
     "voltage": ("resistance", "resistance"),
 }
-"""Signal that drives a shaft -> parameter taken from the winding, and its name there."""
+"""Input of a shaft -> the shaft's parameter, and the parameter of the winding that it equals."""
 FRICTION_PARAMETERS: dict[str, tuple[str, ...]] = {
     "coulomb": ("coulomb_friction", "viscous_friction"),
     "stribeck": ("coulomb_friction", "viscous_friction", "stribeck_friction", "stribeck_speed"),
@@ -93,11 +94,13 @@ FRICTION_PARAMETERS: dict[str, tuple[str, ...]] = {
         "gear_efficiency",
     ),
 }
+"""Friction model -> its free parameters."""
 RIG_PARAMETERS: dict[str, tuple[str, ...]] = {
     "pendulum": ("inertia", "mgl"),
     "free": ("inertia",),
     "load": ("inertia", "constant_torque"),
 }
+"""Rig, which is the kind of load at the output -> its free parameters."""
 DEFAULTS = {
     name: parameter.default
     for name, parameter in PARAMETERS.items()
@@ -117,4 +120,4 @@ ESTIMABLE = {
     "back_emf_constant": "voltage",
     "resistance": "voltage",
 }
-"""Parameter that the logs of a shaft determine -> the only suitable input; None: any input."""
+"""Optional free parameter of a shaft -> the input that it requires; None: any input."""

@@ -1,8 +1,8 @@
 """Choice of the excitation, sample rate and amplitude for a motor, before a measurement.
 
-The expected errors are computed at the true parameters, from a simulated log without noise. They
-follow from the expected noise and the Jacobian of the fit (Fisher information). For a winding they
-include the bias from a voltage that changes between rows, but is modeled as held. Winding and shaft
+A log is simulated without noise. The expected errors follow from the noise of the sensors and the
+Jacobian of the fit at the true parameters (Fisher information). For a winding they include the bias
+from a voltage that changes between rows, but is modeled as held. Winding and shaft
 are fitted separately: the winding to the current, driven by voltage and speed, and the shaft to the
 position, driven by the measured current. Source: Ljung, *System Identification* (2nd ed. 1999),
 sec. 7.4 and 13.2.
@@ -43,14 +43,14 @@ GOALS = {
     "coulomb_friction": 0.05,
     "viscous_friction": 0.05,
 }
-"""Relative error of each parameter that a plan aims at."""
-# A bench has more faults than noise, so that real errors are larger than expected ones.
+"""Parameter -> relative error that a plan aims at."""
+# A real bench has other errors than noise, so that real errors are larger than expected ones.
 MARGIN = 3.0
-"""Factor between the goals and the expected errors of a good plan."""
+"""Factor by which the expected errors of a good plan are below the goals."""
 RATES = (1e3, 2e3, 5e3, 10e3, 20e3)
 """Sample rates [Hz] that are compared."""
 _SEGMENT = 0.25  # duration of a segment [s]
-_PHASE = 0.37  # offset of the excitation's clock from the rows, in row periods
+_PHASE = 0.37  # offset between the clocks of the voltage and of the rows, in row periods
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,8 +65,8 @@ class Sensing(Checked):
         "together", "together", "instantaneous", "mean"
     )
     """Timing of the logged voltage. With `together` the voltage changes only when a row is written.
-    Otherwise it has a separate clock, and a row has its `instantaneous` value, or its `mean` until
-    the next row.
+    Otherwise it changes at other times, and a row contains its `instantaneous` value, or its `mean`
+    until the next row.
     """
 
 
@@ -74,15 +74,15 @@ class Option(NamedTuple):
     """An excitation at a sample rate, with the expected errors."""
 
     excitation: Excitation
-    rate: float  # of the rows [Hz]
+    rate: float  # rate of the rows [Hz]
     peak_current: float  # [A]
-    rms_current: float  # root mean square [A]
+    rms_current: float  # [A]
     # Parameter -> expected relative error; parameters that cannot be identified are left out.
     errors: dict[str, float]
 
     @property
     def worst(self) -> float:
-        """Largest error over its goal; infinite if an electrical parameter cannot be identified."""
+        """Largest ratio of an error to its goal; infinite if an electrical parameter is missing."""
         if any(name not in self.errors for name in ELECTRICAL):
             return math.inf
         return max(error / GOALS[name] for name, error in self.errors.items())
@@ -92,10 +92,10 @@ class Plan(NamedTuple):
     """All options, and the best one."""
 
     options: list[Option]
-    # The option of the lowest rate whose errors are below all goals by `MARGIN`, or else the option
-    # that comes closest.
+    # Among the options whose errors are below all goals by the factor `MARGIN`, the option with the
+    # lowest rate. If there is none, the option with the smallest `worst`.
     best: Option
-    missed: list[str]  # parameters whose goals the best option misses
+    missed: list[str]  # parameters for which the best option misses the goal
     unknown: list[str]  # parameters that are 0 on the datasheet, so that no error can be expected
 
 
@@ -115,7 +115,7 @@ def plan(
         sensing: accuracy of the sensors; None takes the defaults.
         duration: duration of a log [s].
         max_current: largest current of the bench [A]; the drive's limit applies, too.
-        continuous_current: largest root mean square of the motor's current [A].
+        continuous_current: largest RMS current of the motor [A].
     """
     if not duration >= 4.0 * _SEGMENT:
         raise ValueError(
@@ -175,20 +175,28 @@ def _option(
     limits: tuple[float, float],
     truth: Mapping[str, float],
 ) -> Option:
-    """Return an excitation at a rate, as large as the supply and the current limits allow."""
-    constant, together = drive.motor.electrical_time_constant, sensing.voltage == "together"
+    """Assess an excitation at a rate, with the largest amplitude that the limits allow.
+
+    The limits are the supply and `limits`, the largest peak and RMS current [A].
+    """
+    time_constant, together = drive.motor.electrical_time_constant, sensing.voltage == "together"
     excitation = Excitation(
         kind,
         drive.voltage_limit,
         duration,
         frequency=2.0 if kind == "square" else 0.5,
-        highest=min(200.0, 0.5 / constant),
-        # With an even number of rows per change, every second row still sees all changes.
-        clock=2 * max(round(2.0 * constant * rate), 1) / rate if together else 4.0 * constant,
+        highest=min(200.0, 0.5 / time_constant),
+        # The number of rows between changes is even, so that a log of every second row still
+        # contains all changes.
+        clock=(
+            2 * max(round(2.0 * time_constant * rate), 1) / rate
+            if together
+            else 4.0 * time_constant
+        ),
     )
     locked_load = dataclasses.replace(load, locked=load.locked or excitation.locked)
     time, amplitude = sample_times(drive, duration), excitation.amplitude
-    shape = (
+    unit_voltage = (
         excitation.voltage(
             np.floor(time * rate + 1e-6) / rate if together else time + _PHASE / rate
         )
@@ -196,7 +204,7 @@ def _option(
     )
     # The response is nearly proportional to the voltage, so that few iterations suffice.
     for _ in range(8):
-        current = simulate_drive(drive, amplitude * shape, locked_load).signals["current"]
+        current = simulate_drive(drive, amplitude * unit_voltage, locked_load).signals["current"]
         peak, rms = float(np.abs(current).max()), float(np.sqrt(np.mean(current**2)))
         excess = max(peak / limits[0], rms / limits[1])
         if excess <= 1.0:
@@ -204,7 +212,7 @@ def _option(
         amplitude *= 0.98 / excess
     log = simulate(
         drive,
-        amplitude * shape,
+        amplitude * unit_voltage,
         locked_load,
         sampler=Sampler(rate, mean_voltage=sensing.voltage == "mean"),
     )
@@ -215,9 +223,9 @@ def _option(
 def _expected_errors(
     truth: Mapping[str, float], load: Load, sensing: Sensing, log: Log
 ) -> dict[str, float]:
-    """Return the expected relative errors of a winding and a shaft.
+    """Return the expected relative errors of the parameters of a winding and a shaft.
 
-    The winding is fitted to the current at the true speed, the shaft to the position. The torque
+    The winding is fitted to the current with the true speed, the shaft to the position. The torque
     constant is assumed to have the same relative error as the back-EMF constant. Parameters that
     are 0 on the datasheet are left out.
     """
@@ -247,8 +255,10 @@ def _expected_errors(
     shaft_errors = _fit_errors(
         truth, shaft, shaft.segments([log]), 2.0 * math.pi / sensing.encoder / math.sqrt(12.0)
     )
-    constant = errors.get("back_emf_constant", 0.0)
-    return errors | {name: math.hypot(error, constant) for name, error in shaft_errors.items()}
+    constant_error = errors.get("back_emf_constant", 0.0)
+    return errors | {
+        name: math.hypot(error, constant_error) for name, error in shaft_errors.items()
+    }
 
 
 def _fit_errors(

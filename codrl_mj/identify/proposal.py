@@ -41,8 +41,8 @@ If a name has words of several signals, the first signal counts. Single letters 
 longer word matches.
 """
 _READINGS = {"present", "feedback", "measured", "actual", "state"}
-"""Words in the name of a measured signal. Its unit decides which one; without a unit it is a
-position.
+"""Words that mark a measured signal without naming it. The unit decides which signal it is;
+without a unit it is the position.
 """
 # The letter d marks signals of the d axis.
 _NO_SIGNALS = {"error", "err", "limit", "max", "mode", "status", "fault", "gain", "integrator", "d"}
@@ -82,7 +82,7 @@ class Proposal(NamedTuple):
     columns: str
     """Mapping for `read_log` and `--columns`, in which each `UNIT` has to be replaced."""
     doubts: tuple[str, ...]
-    """Columns that are unknown, or whose signal or unit was inferred from values."""
+    """Notes on columns that are unknown, or whose signal or unit was inferred from values."""
     problem: str | None = None
     """Reason why nothing can be identified from these columns, with a remedy; None: no problem."""
 
@@ -102,11 +102,11 @@ def propose_columns(path: Path | str) -> Proposal:
     below them, and the values. A unit that remains unknown is left open, as `UNIT`.
 
     Args:
-        path: of a log in a format of `read_log`.
+        path: file in a format that `read_log` reads.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file cannot be read, or has no column of time or no other signal.
+        ValueError: the file cannot be read, or no time or no other signal is recognized in it.
     """
     path = Path(path)
     if not path.is_file():
@@ -172,8 +172,8 @@ def _signal(name: str, table: Table, used: Collection[str]) -> tuple[str | None,
         signal: next((unit for text in texts if (unit := _valid_unit(signal, text))), None)
         for signal in _NAMES
     }
-    # A unit without its factor would be a wrong one. It stays open here, and `_entry` applies the
-    # factor if it is clear.
+    # A unit without its factor would be wrong. It stays open here, and `_entry` applies the factor
+    # if its meaning is clear.
     units |= {signal: None for signal in _NAMES if _unit_factor(signal, stated, parts)[0]}
     if {*words} & _NO_SIGNALS or ("state" in words and "observation" not in words):
         return None, None, "by its name not a signal that a fit uses, left out"
@@ -278,7 +278,7 @@ def _valid_unit(signal: str, unit: str) -> str | None:
 
 
 def _entry(signal: str, name: str, unit: str | None, table: Table) -> tuple[_Entry, str]:
-    """Return the mapping of a signal, and a doubt about it if its unit is not stated."""
+    """Return the mapping of a signal, and a doubt if its unit is not clearly stated."""
     bare = re.sub(r"\[0\]$", "", name)
     # In a formula, names that are not identifiers are quoted.
     is_identifier = bare.isascii() and bare.isidentifier() and not keyword.iskeyword(bare)
@@ -300,7 +300,7 @@ def _entry(signal: str, name: str, unit: str | None, table: Table) -> tuple[_Ent
 
 
 def _finite_values(name: str, table: Table) -> np.ndarray:
-    """Return the finite numbers of a column, an empty array if it holds texts."""
+    """Return the finite numbers of a column; an empty array if it contains text."""
     try:
         values = table.numeric_column(name)
     except ValueError:
@@ -311,7 +311,7 @@ def _finite_values(name: str, table: Table) -> np.ndarray:
 def _infer_unit(
     signal: str, name: str, formula: str, values: np.ndarray, table: Table
 ) -> tuple[str, str]:
-    """Infer the unit of a column from its values; return it, or an open one, and a doubt."""
+    """Infer the unit of a column from its values; return the unit or `OPEN_UNIT`, and a doubt."""
     if signal == "time" and any(
         isinstance(cell, str) and STAMP.match(cell) for cell in table.columns[name][:2]
     ):
@@ -380,7 +380,7 @@ def _add_voltage(entries: dict[str, _Entry], table: Table) -> list[str]:
             for signal in ("current", "torque", "velocity")
             if signal in entries
         ]
-        # A logged duty varies the motor's voltage: then an almost constant voltage is that of the
+        # With a duty, the motor's voltage varies. An almost constant voltage is then that of the
         # supply, even if no other signal shows that the motor reverses.
         if is_supply_voltage(
             values, [*responses, np.array([-1.0, 1.0])] if "duty" in entries else responses
@@ -400,7 +400,7 @@ def _add_voltage(entries: dict[str, _Entry], table: Table) -> list[str]:
 
 
 def _problem(name: str, table: Table, entries: dict[str, _Entry]) -> str | None:
-    """Return the reason why a fit cannot use these columns with any units; None if it can."""
+    """Return why a fit cannot use these columns, whatever their units; None if it can."""
     units = {
         signal: COLUMN_UNITS[signal] or "1" if entry.unit == OPEN_UNIT else entry.unit
         for signal, entry in entries.items()
@@ -416,7 +416,7 @@ def _problem(name: str, table: Table, entries: dict[str, _Entry]) -> str | None:
     except ValueError as error:
         return str(error)
     obstacle = find_obstacle([log])
-    # As long as the unit of time is open, the rows may turn out to be frequent enough.
+    # While the unit of time is open, the rows may still be frequent enough.
     if obstacle is None or (obstacle.check == "rows" and entries["time"].unit == OPEN_UNIT):
         return None
     return f"{obstacle.message}; {obstacle.remedy}"

@@ -1,4 +1,4 @@
-"""Published measurements of real motors; each file is downloaded and verified by its digest."""
+"""Download of published measurements of real motors, verified by digests."""
 
 import tomllib
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 from codrl_mj.fields import did_you_mean
 from codrl_mj.user_code import asset_path
 
-LAYOUT = "bench_logs"  # subfolder of a data folder that holds the data sets
+DATA_SUBFOLDER = "bench_logs"  # subfolder that holds the downloaded data sets
 
 
 def published_datasets() -> dict[str, dict[str, Any]]:
@@ -36,15 +36,15 @@ def fetch(name: str, folder: Path = Path("data")) -> list[Path]:
     sets = published_datasets()
     if name not in sets:
         raise ValueError(
-            f"NAME = {name!r}: {did_you_mean(name, sets)}published are {', '.join(sets)}"
+            f"NAME = {name!r}: {did_you_mean(name, sets)}must be one of {', '.join(sets)}"
         )
     try:
         import pooch
     except ModuleNotFoundError:
         raise RuntimeError(
-            "measurements are fetched by pooch: pip install 'codrl-mj[data]'"
+            "downloading measurements needs pooch: pip install 'codrl-mj[data]'"
         ) from None
-    dataset, target = sets[name], folder / LAYOUT / name
+    dataset, target = sets[name], folder / DATA_SUBFOLDER / name
     base = dataset["source"].replace("https://github.com/", "https://raw.githubusercontent.com/")
     paths = []
     pooch.get_logger().setLevel("WARNING")

@@ -44,12 +44,12 @@ class Table(NamedTuple):
     lines: Sequence[int] = ()  # line of the file for each row
     units: Mapping[str, str] = {}  # column -> unit, if a line states the units
     decimal_commas: bool = False  # True if numbers may have a decimal comma
-    # Column that held lists -> names of their entries, such as joints.
+    # Name of a column of lists -> names of the lists' entries, such as joints.
     entries: Mapping[str, list[str]] = {}
 
     @property
     def labels(self) -> dict[str, str]:
-        """Names of entries -> columns, as action[elbow] -> action[1]."""
+        """Entries by name -> entries by index, for example action[elbow] -> action[1]."""
         pairs = (
             (name, *pair) for name, entries in self.entries.items() for pair in enumerate(entries)
         )
@@ -96,13 +96,13 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
             line of column names, and commas, semicolons, tabs or blanks between values. Lines that
             begin with # or have only one cell are skipped. A line without numbers below the names
             states the units. Decimal commas, times of day (ISO 8601) and Latin-1 are accepted.
-            JSON is a list of rows; or an object with one such list, such as `entries`, and numbers,
-            which formulas can use; or an object of columns. If the cells of a column are lists,
+            JSON is a list of rows; or an object that contains such a list, and numbers that
+            formulas can use; or an object of columns. If the cells of a column are lists,
             `column[0]` is the first entry, and `column[elbow]` the entry with that name, according
             to `features` in the file or in meta/info.json of the data set that contains the file.
         columns: `signal=formula:unit` separated by commas, or a mapping of signals to
-            `formula:unit`. A voltage is held until the next row, or `mean(formula)` is its mean
-            until the next row. `only=formula` leaves out the rows where it is 0.
+            `formula:unit`. A voltage counts as held until the next row, and `mean(formula)` as its
+            mean until the next row. `only=formula` leaves out the rows where the formula is 0.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -121,9 +121,9 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
 
 
 def table_to_log(name: str, table: Table, mapping: Mapping[str, Column]) -> Log:
-    """Return the log of a file's contents and a mapping; see `read_log`."""
+    """Convert the contents of a file to a log by a mapping of its columns; see `read_log`."""
     count = len(next(iter(table.columns.values()), ()))
-    # Row numbers count incomplete rows, too, so that they match the file.
+    # Incomplete rows are counted, too, so that row numbers match the file.
     row_numbers = np.setdiff1d(np.arange(1, count + len(table.ragged) + 1), table.ragged)
     labels = table.labels
     used = set().union(*(column.names for column in mapping.values()))
@@ -149,7 +149,7 @@ def table_to_log(name: str, table: Table, mapping: Mapping[str, Column]) -> Log:
         *_left_out(
             row_numbers[rows[~forward]],
             "stamps",
-            "have a time that is not later than in all rows before, and are left out",
+            "have a time that is not later than all times before, and are left out",
         ),
         *(
             Finding(
@@ -196,7 +196,7 @@ def table_to_log(name: str, table: Table, mapping: Mapping[str, Column]) -> Log:
 def _find_unsigned(
     values: Mapping[str, Any], mapping: Mapping[str, Column], row_numbers: np.ndarray
 ) -> Iterator[Finding]:
-    """Find columns that look like signed registers which were read as unsigned numbers."""
+    """Find columns that look like signed registers read as unsigned numbers."""
     unconverted = (
         column
         for column in mapping.values()
@@ -255,7 +255,7 @@ def _find_unsigned(
 
 
 def _left_out(rows: np.ndarray, check: str, reason: str) -> Iterator[Finding]:
-    """Report rows that are left out, by their numbers in the file, from 1."""
+    """Report rows that are left out; `rows` are their numbers in the file, from 1."""
     if rows.size:
         text = f"{rows.size} row{'s' if rows.size > 1 else ''}, the first one {rows[0]}, {reason}"
         remedy = (
@@ -321,7 +321,7 @@ def _entry_names(content: Any) -> dict[str, list[str]]:
 
 
 def _read_table(path: Path) -> Table:
-    """Return the contents of a file, with lists in their columns."""
+    """Return the contents of a file; columns of lists are not split yet."""
     kind = Path(path.name.removesuffix(".gz")).suffix.lower()
     if kind == ".parquet":
         try:
@@ -341,7 +341,7 @@ def _read_table(path: Path) -> Table:
         text = content.decode(
             "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
         )
-    # Instruments write the signs of degrees and ohms in Latin-1.
+    # Instruments often write signs such as ° and µ in Latin-1.
     except UnicodeDecodeError:
         text = content.decode("latin-1")
     return _json(json.loads(text)) if kind == ".json" else _csv(text)
@@ -355,8 +355,8 @@ def _csv(text: str) -> Table:
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     bare = [(number, line) for number, line in lines if not line.startswith("#")]
     last = [line for _, line in bare[-20:]]
-    # A separator occurs in most of the last lines. If several do, the first line that has any of
-    # them decides: it is the line of names, because notes above it seldom have one.
+    # A candidate for the separator occurs in most of the last lines. Among several candidates, the
+    # one in the first line with any of them is taken: that is usually the line of names.
     usual = [mark for mark in ";\t," if 2 * sum(mark in line for line in last) > len(last)]
     separator = next((mark for _, line in bare for mark in usual if mark in line), " ")
     cells = []
@@ -416,7 +416,7 @@ def _csv(text: str) -> Table:
 
 
 def _is_filled(row: Sequence[str]) -> bool:
-    """Return True for a row of the table: most cells are numbers, or all mark missing values."""
+    """Return True if most cells of a row are numbers, or if all cells mark missing values."""
     num_missing, num_numbers = sum(cell.lower() in ("", "null", "none", "na") for cell in row), 0
     for cell in row:
         try:
@@ -448,6 +448,6 @@ def _json(content: Any) -> Table:
     ):
         return Table(lists, constants, [], entries=_entry_names(content))
     raise ValueError(
-        "JSON must be a list of rows, an object with one such list and numbers beside it, or an"
+        "JSON must be a list of rows, an object with one such list and other numbers, or an"
         " object of columns of the same length"
     )

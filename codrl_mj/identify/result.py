@@ -15,14 +15,14 @@ from codrl_mj.runs.files import atomic_write, write_json
 
 Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "refused"]
 ACTUATOR = "actuator.yaml"  # name of the file in a folder of results
-# Above this share the columns or the model are wrong, and the parameters are meaningless.
+# Above this share, the columns or the model must be wrong, and the parameters are meaningless.
 MAX_UNEXPLAINED = 0.2
-"""Largest unexplained share of the motion with which parameters are usable."""
+"""Largest unexplained share of a log's variation at which parameters are usable."""
 USABLE = ("identified", "rough", "given")
 """Status of parameters from which an actuator can be made."""
 HORIZON = 0.5  # duration [s] of a prediction
 START_DURATION = 0.03
-"""Duration [s], or five rows if longer, at the start of a prediction that fit its initial state."""
+"""Duration [s] at the start of a prediction to which the initial state is fitted; >= 5 rows."""
 
 
 def base_motor(base: Mapping[str, Any] | None) -> Any:
@@ -43,8 +43,8 @@ def missing_parameters(names: Collection[str], base: Mapping[str, Any] | None) -
         and "rotor_inertia" not in names
     ):
         return (
-            "rotor_inertia is unknown (0) in the datasheet, and the logs show only the inertia of"
-            " all that moves. Give the inertia at the output without the motor's: --known"
+            "rotor_inertia is unknown (0) in the datasheet, and the logs show only the total"
+            " moving inertia. Give the inertia of the load at the output: --known"
             " load_inertia=VALUE; or --known rotor_inertia=0 if the model that you train in"
             " contains the rotor"
         )
@@ -56,7 +56,7 @@ def missing_parameters(names: Collection[str], base: Mapping[str, Any] | None) -
     remedy = f"--known {flags}, or name the motor that has the other parameters with --motor NAME"
     if lacking[-1] == "rotor_inertia":
         remedy += (
-            "; instead of the rotor's inertia you can give the load's: --known load_inertia=VALUE,"
+            "; instead of rotor_inertia you can give that of the load: --known load_inertia=VALUE,"
             " 0 for a motor without load"
         )
     return (
@@ -119,9 +119,9 @@ class Prediction:
     output: str
     """Predicted signal, `position` [rad] or `velocity` [rad/s]."""
     open_loop: float
-    """Error of predictions over `HORIZON` with the logged input, after `START_DURATION`."""
+    """Error with the logged input, in predictions that last `HORIZON`, after `START_DURATION`."""
     closed_loop: float | None
-    """Error over the whole log with a proportional controller; None if none fits the input."""
+    """Error of a simulation of the whole log with its controller; see `closed_loop_error`."""
     trace: Trace | None = dataclasses.field(default=None, compare=False, repr=False)
     """Simulation of `open_loop`; not written to files."""
 
@@ -147,9 +147,9 @@ def predict(fit: Fit, log: Log) -> Prediction:
 def closed_loop_error(fit: Fit, log: Log) -> float | None:
     """Return the mean absolute error [rad] over a whole log under its command.
 
-    The servo is modeled as a proportional controller. Its gain is fitted to the control error and
-    the input, where the input is not at its limit. The limit of a voltage is the `bus`, if it was
-    logged; otherwise it is the largest input of the log.
+    The servo is modeled as a proportional controller. Its gain is fitted to those rows in which the
+    input is not at its limit. The limit of a voltage is the supply's, if `bus` was logged;
+    otherwise the limit is the largest input of the log.
 
     Returns:
         None if the log has no command, or if no proportional controller explains the input.
@@ -214,7 +214,7 @@ class Identified:
     driven_by: str | None
     """Input of the shaft in the fit; None if only the winding was fitted."""
     delays: Mapping[str, float]
-    """Delay [rows] of the input of `winding` and `shaft`, 0.5 for a voltage sampled at the rows."""
+    """Part (`winding` or `shaft`) -> delay [rows] of its input; 0.5: sampled at the rows."""
     estimates: tuple[Estimate, ...]
     fitted: tuple[Prediction, ...]
     """Errors on the fitted logs."""
@@ -222,17 +222,17 @@ class Identified:
     """Errors on the logs held out."""
     warnings: tuple[str, ...]
     base: Mapping[str, Any] | None = None
-    """Mapping of a drive, which supplies parameters that the logs do not determine, or None."""
+    """Mapping of a drive that supplies the parameters that the logs do not determine, or None."""
     traces: tuple[Trace, ...] = ()
     """Traces of winding and shaft for the fitted logs; not written to files."""
     correlations: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(
         default_factory=dict
     )
-    """Correlations between the parameters of `winding`, and between those of `shaft`."""
+    """Part (`winding` or `shaft`) -> correlations between its parameters."""
     supply: float | None = None
     """Largest logged voltage [V] of the supply or at the terminals; None: no logged voltage."""
     unexplained: float = 0.0
-    """Largest unexplained share of a log's variation, if it exceeds the noise of the sensors."""
+    """Largest unexplained share of a log's variation; 0 if it may be noise of the sensors."""
     friction_reason: str = ""
     """Reason for the choice of `friction`; empty if it was requested."""
 
@@ -244,11 +244,11 @@ class Identified:
         raise KeyError(name)
 
     def problem(self) -> str | None:
-        """Return the reason why there is no actuator, with a remedy; None if there is one."""
+        """Return the reason why no actuator can be made, with a remedy; None if it can."""
         if self.unexplained > MAX_UNEXPLAINED:
             return (
                 f"the fit leaves {self.unexplained:.0%} of a log's variation unexplained, so that"
-                " its parameters mean little. Correct the columns, their units and signs, or the"
+                " its parameters are unreliable. Correct the columns, their units and signs, or the"
                 " rig: codrl-mj identify check"
             )
         unusable = [
@@ -275,7 +275,7 @@ class Identified:
 
     @property
     def supply_text(self) -> str | None:
-        """Supply of the actuator and its source, as a sentence; None without an actuator."""
+        """Text on the actuator's supply and its source; None without an actuator."""
         if self.problem() is not None:
             return None
         volts, source = (
@@ -293,7 +293,7 @@ class Identified:
 
     @property
     def base_text(self) -> str | None:
-        """Parameters of the actuator from the base, as a sentence; None if there are none."""
+        """Text on the parameters that the base drive supplies; None if there are none."""
         motor = base_motor(self.base)
         if motor is None or self.problem() is not None:
             return None
@@ -311,7 +311,7 @@ class Identified:
         )
 
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """Return the intervals of usable parameters by field of a drive, without known values."""
+        """Return the intervals of the usable, not exactly known parameters, by field of a drive."""
         return {
             f"motor.{estimate.name}": (estimate.low, estimate.high)
             for estimate in self.estimates

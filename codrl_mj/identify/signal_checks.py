@@ -13,7 +13,7 @@ def signal_findings(log: Log) -> Iterator[Finding]:
     """Yield findings about each signal by itself."""
     for signal in log.signals:
         yield from _resolution(log, signal)
-        # Commanded signals, such as the voltage, may rest at a limit or change seldom.
+        # Commanded signals, such as the voltage, may legitimately rest at a limit or change seldom.
         if signal in _MEASURED:
             yield from _repeated(log, signal)
         if signal in ("current", "torque", "velocity"):
@@ -30,18 +30,18 @@ def _resolution(log: Log, signal: str) -> Iterator[Finding]:
     if spread < 100.0 * step if signal == "position" else step > 0.1 * float(np.std(values)):
         text = (
             f"{signal} has a resolution of {step:.3g} {unit} and spans {spread:.3g} {unit}, which"
-            f" are {spread / step:.0f} steps"
+            f" is {spread / step:.0f} steps"
         )
         remedies = {
             "position": "move further, or use a finer encoder",
             "velocity": "leave it out and use the position, or smooth it over several milliseconds",
         }
-        remedy = remedies.get(signal, "measure in a smaller range, or drive harder")
+        remedy = remedies.get(signal, "measure in a smaller range, or use a larger amplitude")
         yield Finding("warning", "resolution", None, text, remedy)
 
 
 def _repeated(log: Log, signal: str) -> Iterator[Finding]:
-    """Find a signal that is sampled less often than rows are written, so that values repeat."""
+    """Find a signal that is sampled less often than rows are written, so that rows repeat it."""
     steps = np.diff(log.signals[signal])
     changes = np.flatnonzero(steps)
     if len(changes) < 20:
@@ -84,7 +84,7 @@ def _saturation(log: Log, signal: str) -> Iterator[Finding]:
 
 
 def _outliers(log: Log, signal: str) -> Iterator[Finding]:
-    """Find single rows that differ from both neighbors by much more than other rows do."""
+    """Find single rows that differ from both neighbors much more than usual."""
     values = log.signals[signal]
     if len(values) < 50:
         return

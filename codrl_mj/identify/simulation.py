@@ -2,7 +2,7 @@
 
 Friction is that of `GearMotor`: `codrl_mj.actuators.shaft.friction` is subtracted from the motor's
 torque, and then Coulomb friction stops and holds the shaft, as MuJoCo's friction constraint does.
-So fitted parameters have the same meaning in a simulation with MuJoCo.
+Fitted parameters therefore have the same meaning in a simulation with MuJoCo.
 """
 
 import math
@@ -41,7 +41,7 @@ class ShaftParameters(NamedTuple):
 def shaft_parameters(
     parameters: Mapping[str, float], gain: float, braking: float = 0.0
 ) -> ShaftParameters:
-    """Convert parameters by the names of `PARAMETERS` from the rotor to the output."""
+    """Convert parameters, named as in `PARAMETERS`, from values at the rotor to the output."""
     ratio = parameters["gear_ratio"]
     return ShaftParameters(
         parameters["inertia"],
@@ -67,20 +67,24 @@ def simulate_winding(
     current: float,
     resistance: float,
     inductance: float,
-    constant: float,
+    back_emf_constant: float,
 ) -> np.ndarray:
-    """Return the currents [A] at the times, shape (n,), exact for held voltages and speeds."""
+    """Return the currents [A] at the times, shape (n,).
+
+    They are exact if voltages and speeds are constant between rows. `speeds` and
+    `back_emf_constant` must refer to the same side of the gear.
+    """
     currents = np.empty(len(times))
     currents[0] = current
     for row in range(len(times) - 1):
         # expm1 keeps its accuracy when the step is much shorter than the time constant L/R.
         share = -math.expm1(-resistance * (times[row + 1] - times[row]) / inductance)
-        final = (volts[row] - constant * speeds[row]) / resistance
+        final = (volts[row] - back_emf_constant * speeds[row]) / resistance
         currents[row + 1] = currents[row] + (final - currents[row]) * share
     return currents
 
 
-# numba needs the function as a global of this module.
+# Compiled code can call the friction function only through a global of this module.
 _friction: Any = numba.njit(shaft.friction)
 _Shaft: Any = shaft.Shaft
 
@@ -98,7 +102,8 @@ def step_shaft(
     substeps = max(math.ceil(duration / MAX_SUBSTEP - 1e-6), 1)
     step = duration / substeps
     damping = 0.5 * step * (parameters.viscous + parameters.braking) / parameters.inertia
-    # With the implicit damping included, a shaft comes to rest exactly where its torques balance.
+    # The implicit damping acts like an additional inertia. With it, a shaft comes to rest exactly
+    # where its torques balance.
     inertia = parameters.inertia * (1.0 + damping)
     for substep in range(substeps):
         position += 0.5 * step * speed
@@ -165,7 +170,7 @@ def simulate_servo(
 ) -> np.ndarray:
     """Return the positions of a servo at the times, shape (n,).
 
-    Its input gain*(target - position), clipped to the limit, is held until the next row.
+    The input is gain*(target - position), clipped to the limit, and is held until the next row.
     """
     positions = np.empty(len(times))
     positions[0] = position
@@ -181,40 +186,41 @@ def simulate_servo(
 @njit(nogil=True, error_model="numpy")
 def simulate_samples(
     period: float,
-    shares: np.ndarray,
-    limit: float,
-    sag: float,
+    duties: np.ndarray,
+    supply_voltage: float,
+    supply_resistance: float,
     parts: Any,
     locked: bool,
     position: float,
 ) -> np.ndarray:
     """Simulate a drive, and return its state at each sample, shape (n, 5).
 
-    The shaft moves for half a sample, then the winding is solved exactly for a whole sample at that
-    speed, then the shaft moves for the other half (Strang splitting, second order).
+    In each period the shaft moves for half a period, then the winding is solved exactly for a whole
+    period at that speed, then the shaft moves for the other half (Strang splitting, second order).
 
     Args:
         period: period of the samples [s].
-        shares: duty of the bridge at each sample, in [-1, 1].
-        limit: voltage of the supply without load [V].
-        sag: resistance of the supply [ohm].
+        duties: duty of the bridge at each sample, in [-1, 1].
+        supply_voltage: voltage of the supply without load [V].
+        supply_resistance: internal resistance of the supply [ohm].
         parts: tuple of (R, L, kE at the output) and `ShaftParameters`.
         locked: True if the shaft is held.
         position: initial position [rad].
 
     Returns:
-        Voltage, current, speed and position of the output, and voltage of the bus.
+        Columns: motor voltage [V], current [A], output speed [rad/s], output position [rad] and
+        supply voltage under load [V].
     """
-    states = np.empty((len(shares), 5))
-    (resistance, inductance, constant), parameters = parts
+    states = np.empty((len(duties), 5))
+    (resistance, inductance, back_emf_constant), parameters = parts
     current, speed, decay = 0.0, 0.0, math.exp(-resistance * period / inductance)
-    for row in range(len(shares)):
-        bus = limit - sag * shares[row] * current
-        voltage = shares[row] * bus
+    for row in range(len(duties)):
+        bus = supply_voltage - supply_resistance * duties[row] * current
+        voltage = duties[row] * bus
         states[row] = voltage, current, speed, position, bus
         if not locked:
             position, speed = step_shaft(0.5 * period, current, 0.0, position, speed, parameters)
-        final = (voltage - constant * speed) / resistance
+        final = (voltage - back_emf_constant * speed) / resistance
         current = final + (current - final) * decay
         if not locked:
             position, speed = step_shaft(0.5 * period, current, 0.0, position, speed, parameters)

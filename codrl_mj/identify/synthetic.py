@@ -1,9 +1,9 @@
-"""Synthetic logs: a simulated drive under a voltage, with sensors, a sampler and selectable faults.
+"""Synthetic logs: simulation of a drive with a given voltage, and of sensors with faults.
 
-Voltages are pure functions of time. Slow motion shows resistance, back-EMF and friction; only
-changes within the winding's time constant L/R show the inductance. A PRBS is a pseudo-random binary
-sequence with a nearly flat spectrum up to its clock rate. Source: Ljung, *System Identification*
-(2nd ed. 1999), sec. 13.3.
+The voltages of excitations are functions of time alone. Slow motion shows resistance, back-EMF and
+friction; only changes within the winding's time constant L/R show the inductance. A PRBS is a
+pseudo-random binary sequence with a nearly flat spectrum up to its clock rate. Source: Ljung,
+*System Identification* (2nd ed. 1999), sec. 13.3.
 """
 
 import dataclasses
@@ -28,15 +28,15 @@ class Excitation(Checked):
     kind: str = "prbs"
     """Kind of the voltage, a key of `EXCITATIONS`."""
     amplitude: float = real(1.0, above=0.0, unit="V")
-    """Largest voltage [V], > 0."""
+    """Amplitude of the voltage [V], > 0."""
     duration: float = real(4.0, above=0.0, unit="s")
     """Duration [s], > 0."""
     frequency: float = real(0.5, above=0.0, unit="Hz")
     """Frequency of the slow sine and of the square wave [Hz], > 0."""
     highest: float = real(200.0, above=0.0, unit="Hz")
-    """Final frequency of the chirp [Hz], > 0; it begins at `frequency`."""
+    """Final frequency of the chirp [Hz], > 0; the chirp begins at `frequency`."""
     clock: float = real(2.0e-3, above=0.0, unit="s")
-    """Shortest time [s] between two changes of a PRBS, > 0; about 4 L/R."""
+    """Shortest time [s] between two changes of a PRBS, > 0; about 4 L/R is a good choice."""
 
     def __post_init__(self) -> None:
         """Validate all fields."""
@@ -49,7 +49,7 @@ class Excitation(Checked):
         return self.kind == "locked_prbs"
 
     def voltage(self, time: np.ndarray) -> np.ndarray:
-        """Return the voltage [V] at times [s], of their shape; 0 after the duration."""
+        """Return the voltages [V] at times [s] of any shape; 0 after the duration."""
         time = np.asarray(time, dtype=float)
         return self.amplitude * np.where(
             time < self.duration, EXCITATIONS[self.kind](self, time), 0.0
@@ -62,7 +62,7 @@ def _slow_sine(excitation: Excitation, time: np.ndarray) -> np.ndarray:
 
 
 def _prbs(excitation: Excitation, time: np.ndarray) -> np.ndarray:
-    """Return -1 and 1 in a sequence of length 2^13 - 1 from a shift register."""
+    """Return a pseudo-random sequence of -1 and 1, which repeats after 2^13 - 1 values."""
     from scipy.signal import max_len_seq
 
     bits = 2.0 * max_len_seq(13)[0].astype(float) - 1.0
@@ -74,7 +74,7 @@ EXCITATIONS: dict[str, Callable[[Excitation, np.ndarray], np.ndarray]] = {
     "square": lambda excitation, time: np.where(
         (excitation.frequency * time) % 1.0 < 0.5, 1.0, -1.0
     ),
-    # The phase of a frequency that grows linearly has half of its slope.
+    # The phase is the integral of a frequency that grows linearly, hence the factor 0.5.
     "chirp": lambda excitation, time: np.sin(
         2.0
         * math.pi
@@ -90,7 +90,7 @@ EXCITATIONS: dict[str, Callable[[Excitation, np.ndarray], np.ndarray]] = {
     # The shaft is held: see `Excitation.locked`.
     "locked_prbs": _prbs,
 }
-"""Kind -> function of amplitude 1."""
+"""Kind of an excitation -> its voltage with amplitude 1, as a function of time."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,13 +102,13 @@ class Load(Checked):
     gravity: float = real(0.0, minimum=0.0, unit="N*m")
     """m*g*l [N*m] of a pendulum that hangs at position 0, >= 0."""
     against: float = real(0.0, unit="N*m")
-    """Constant torque [N*m] against the motor, such as that of a lifted weight."""
+    """Constant load torque [N*m] that opposes positive speeds, such as that of a lifted weight."""
     locked: bool = False
     """True if the shaft is held."""
 
 
 FREE = Load()
-"""No load besides the rotor."""
+"""No load: only the rotor moves."""
 SIMULATED_SIGNALS = ("current", "position", "velocity", "torque", "bus", "voltage", "duty")
 """Signals of a simulated log."""
 _SAMPLE_SIZE, _ROW_SIZE = (80, 200)
@@ -128,12 +128,12 @@ class Sensor(Checked):
     gain: float = real(1.0, unit="")
     """Measured value over the true value; -1 is a wrong sign."""
     bias: float = real(0.0, unit="")
-    """Measured value of a true value of 0, in the signal's unit."""
+    """Measured value at a true value of 0, in the signal's unit."""
     outliers: float = real(0.0, minimum=0.0, maximum=1.0)
-    """Share of values, in [0, 1], that are off by 3 to 10 of the signal's standard deviations."""
+    """Share of outliers, in [0, 1], which are off by 3 to 10 standard deviations of the signal."""
 
     def measure(self, values: np.ndarray, random: np.random.Generator) -> np.ndarray:
-        """Return measured values, shape (n,), of true values that are delayed already."""
+        """Return measured values, shape (n,), of true values that already include the delay."""
         measured = self.gain * values + self.bias + self.noise * random.standard_normal(len(values))
         is_outlier = random.random(len(values)) < self.outliers
         errors = random.uniform(3.0, 10.0, len(values)) * random.choice([-1.0, 1.0], len(values))
@@ -164,10 +164,10 @@ class Sampler(Checked):
 def simulate_drive(
     drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, position: float = 0.0
 ) -> Log:
-    """Simulate a drive without its control loop from standstill, and return its samples.
+    """Simulate a drive in open loop from standstill, and return its samples.
 
-    The bridge applies a duty d = u/V. The voltage V of the supply sags by the resistance of the
-    supply times d*i.
+    The bridge applies a duty d = u/V, where V is the voltage of the supply without load. Under load
+    the supply's voltage falls by d*i times the resistance of the supply.
 
     Args:
         drive: drive to simulate.
@@ -186,7 +186,7 @@ def simulate_drive(
         locked = locked or excitation.locked
         excitation = excitation.voltage(sample_times(drive, excitation.duration))
     commanded = np.clip(excitation, -limit, limit)
-    shares = (
+    duties = (
         np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
     )
     resistance = resistance_at(motor, motor.ambient_temperature)
@@ -205,11 +205,11 @@ def simulate_drive(
     }
     parts = winding, shaft_parameters(parameters, motor.torque_constant * motor.gear_ratio)
     states = simulate_samples(
-        period, shares, float(limit), float(drive.supply_resistance), parts, locked, float(position)
+        period, duties, float(limit), float(drive.supply_resistance), parts, locked, float(position)
     )
     names = "voltage", "current", "velocity", "position", "bus"
     signals = dict(zip(names, states.T, strict=True))
-    return Log("course", period * np.arange(len(shares)), {**signals, "command": commanded})
+    return Log("course", period * np.arange(len(duties)), {**signals, "command": commanded})
 
 
 def sample_times(drive: Drive, duration: float) -> np.ndarray:
@@ -220,7 +220,7 @@ def sample_times(drive: Drive, duration: float) -> np.ndarray:
 
 
 def check_size(drive: Drive, duration: float, rate: float) -> None:
-    """Raise an error if a simulation of a duration [s] at a rate [Hz] exceeds the memory."""
+    """Raise an error if a duration [s] with rows at a rate [Hz] needs too much memory."""
     samples, rows = duration * drive.controller.sample_rate, duration * rate
     size = f"{duration:,g} s are {samples:,.0f} samples of the drive and {rows:,.0f} rows"
     remedy = "shorten the duration (--duration), or lower the rate of the rows"
@@ -239,7 +239,8 @@ def simulate(
 ) -> Log:
     """Simulate a drive, and return a log of all signals.
 
-    The logged voltage is the requested one, without sag; the logged torque is n*kT*i.
+    The logged voltage is the requested one, without the sag of the supply. The logged torque is
+    n*kT*i, with the gear ratio n.
 
     Args:
         drive: drive to simulate.
@@ -258,7 +259,7 @@ def simulate(
     random = np.random.default_rng(seed)
     period = 1.0 / sampler.rate
     time = period * np.arange(math.floor(samples.time[-1] / period + 1e-9) + 1)
-    # The first and the last row stay at the ends of the simulation.
+    # Jitter does not move the first and the last row, so that the log has the full duration.
     time[1:-1] += (
         period * sampler.jitter * np.clip(random.standard_normal(max(len(time) - 2, 0)), -3.0, 3.0)
     )

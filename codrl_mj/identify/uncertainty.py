@@ -1,10 +1,10 @@
 """Uncertainty of a fit: interval and status of each parameter, and warnings about the logs.
 
 Intervals from the curvature at the optimum are valid only for an exact model, and no model is
-exact. So whole stretches of the logs are resampled, and the interval is widened by the differences
-between logs, by the error of a fit to data simulated with the fitted parameters (self-test), and by
-the change at half the sample rate. Directions in which the parameters cannot be identified are
-reported.
+exact. Therefore whole stretches of the logs are resampled. The intervals also include the
+differences between logs, the error of a fit to data simulated with the fitted parameters
+(self-test), and the change at half the sample rate. Directions in which the parameters cannot be
+identified are reported.
 """
 
 import dataclasses
@@ -21,19 +21,20 @@ from codrl_mj.identify.parameters import DEFAULTS, FRICTION, PARAMETERS, WINDING
 from codrl_mj.identify.result import MAX_UNEXPLAINED, USABLE, Estimate, Status
 
 MIN_LOGS = 5
-"""Smallest number of logs at which whole logs are resampled; with fewer logs, blocks are."""
+"""Minimum number of logs to resample whole logs; with fewer logs, blocks are resampled."""
 DRAWS = 500
 """Number of resamplings."""
-# With parameters scaled to standard errors of 1, no direction gets a standard error above 1e6.
+# The matrix is normalized to a standard error of 1 for each parameter with the others fixed. The
+# limit keeps the standard error in every direction below 1e6.
 MIN_EIGENVALUE = 1e-12
 """Smallest eigenvalue of a normalized Gauss-Newton matrix that is inverted."""
 ATTENUATION = 6.0
-"""Largest relative bias from errors of the input, per unexplained share of the variance."""
+"""Upper limit of the relative bias from errors of the input, per unexplained share of variance."""
 # Dry friction gives the cost many minima.
 SLACK = 1e-3
-"""Share of the cost by which a fit may be better only because it reached another minimum."""
+"""Relative difference of costs that may only come from reaching different minima."""
 PROBE_CHANGE = 0.5
-"""Relative change along a direction. The direction is unidentifiable if the cost hardly changes."""
+"""Relative change of a parameter that tests whether a direction is identifiable."""
 MIN_SHARE = 0.1
 """Smallest share of a parameter in a direction that is reported."""
 MAX_HALF_WIDTH = 0.3
@@ -44,17 +45,17 @@ MAX_IDENTIFIED = {
     "torque_constant": 0.05,
     "inductance": 0.15,
 }
-"""Parameter -> relative half-width beyond which it is rough; for others `MAX_HALF_WIDTH`."""
-# Sensors are not calibrated any better.
+"""Parameter -> largest relative half-width of `identified`; `MAX_HALF_WIDTH` for others."""
+# Sensors are not calibrated more accurately than this.
 MIN_HALF_WIDTH = 0.002
 """Smallest relative half-width of an interval."""
 # Time stamps, and the back-EMF that is held for a row, are uncertain by about a fifth of a row.
 MIN_HALF_WIDTHS = {"inductance": 0.02}
 """Parameter -> its smallest relative half-width, if it is not `MIN_HALF_WIDTH`."""
 MAX_FRICTION = 0.1
-"""Relative half-width beyond which a friction parameter is rough."""
+"""Largest relative half-width of a friction parameter with the status `identified`."""
 MAX_BIAS = 0.5
-"""Largest error of the self-test, over the largest usable half-width, that is not reported."""
+"""Self-test error, over the largest usable half-width, above which it is a reason to refuse."""
 CAUSES = {
     "curvature": "the logs hardly depend on it",
     "resampling": "parts of the logs disagree",
@@ -62,7 +63,7 @@ CAUSES = {
     "half_rate": "a fit of every second row gives another value",
     "self_test": "a fit to its own simulation gives another value",
     "unexplained": "the model does not explain the current",
-    "torque_constant": "the winding's constant that it depends on is not known better",
+    "torque_constant": "the constant of the winding that it depends on is not known better",
 }
 """Cause of an interval's width -> its description."""
 BOUND_MARGIN = 1e-3
@@ -81,7 +82,7 @@ def assess_fits(
     If a log's unexplained share exceeds `MAX_UNEXPLAINED`, all fitted parameters are refused.
 
     Returns:
-        All parameters that are fitted, known or derived; warnings; and the largest unexplained
+        All parameters that are fitted, known or derived, the warnings, and the largest unexplained
         share of a log.
     """
     estimates: list[Estimate] = []
@@ -89,7 +90,7 @@ def assess_fits(
     unexplained_shares: dict[str, float] = {}
     for name, fit in parts.items():
         part_estimates, fixed = _assess_part(fit, seed, step(name)), fit.model.known
-        # The shaft cannot be known better than the constant of the fitted winding.
+        # The shaft was fitted with a constant of the fitted winding, and inherits its uncertainty.
         for parameter, source in WINDING_SOURCES.values():
             if parameter in fixed and parameter not in known:
                 constant = [estimate for estimate in estimates if estimate.name == source]
@@ -122,9 +123,9 @@ def _assess_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estim
     model, names = fit.model, fit.model.names
     if not names:
         return []
-    friction, slopes_by_name, full_friction = _friction(fit)
-    # Changes are relative to the value or, for friction, to the value at which that parameter alone
-    # would account for all friction.
+    friction, slopes_by_name, full_friction = _total_friction(fit)
+    # Relative errors refer to the value of a parameter. For a friction parameter they refer to the
+    # value at which it alone would account for all friction.
     magnitudes = [
         full_friction[name] if name in FRICTION else abs(fit.values[index])
         for index, name in enumerate(names)
@@ -132,7 +133,7 @@ def _assess_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estim
     scales = np.maximum(magnitudes, 1e-6 * model.scales)
     slopes, matrix = np.array([slopes_by_name.get(name, 0.0) for name in names]), np.eye(len(names))
     values, sizes, units = fit.values, scales, model.scales
-    # The sum of all friction is often known better than its components.
+    # The total friction is often known better than its components.
     if any(slopes):
         names, matrix, values = (
             (*names, "friction_torque"),
@@ -154,8 +155,8 @@ def _assess_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estim
         for direction, change in zip(directions, changes, strict=True)
         if abs(change) > MIN_SHARE
     ]
-    # The three statistical causes measure the same errors, so that only the largest one counts. The
-    # change at half the rate is independent of them. Biases are added.
+    # The three statistical causes estimate the same errors, so that only the largest one counts.
+    # The change at half the rate is independent of them, and is added in squares. Biases are added.
     statistical = np.max([by_cause[cause] for cause in ("curvature", "resampling", "logs")], axis=0)
     total = (
         np.hypot(statistical, by_cause["half_rate"])
@@ -166,7 +167,7 @@ def _assess_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estim
         total, [MIN_HALF_WIDTHS.get(name, MIN_HALF_WIDTH) for name in names] * values
     )
     max_half_widths = dict.fromkeys(names, MAX_HALF_WIDTH)
-    # If the sum is known well, errors of its components compensate each other.
+    # If the total friction is known well, errors of its components compensate each other.
     if any(slopes) and half_widths[-1] <= MAX_FRICTION * values[-1]:
         max_half_widths |= {name: 1.0 for name in names if name in FRICTION}
     estimates = []
@@ -221,10 +222,10 @@ def _verdict(
     """Return the status of a parameter, and the reason.
 
     Args:
-        estimate: estimate without a final status.
+        estimate: estimate that has no final status yet.
         half_width: half-width of the interval.
-        size: reference of relative half-widths.
-        unit: scale for the distance from a bound.
+        size: value that relative half-widths refer to.
+        unit: scale of the distance from a bound.
         max_half_width: largest usable half-width, relative to `size`.
         self_test_value: value from a fit to data that were simulated with the fitted parameters.
     """
@@ -234,7 +235,7 @@ def _verdict(
         PARAMETERS[estimate.name].lower,
         PARAMETERS[estimate.name].upper,
     )
-    # Friction may be absent: then a value at this bound is no sign of a failed fit.
+    # A value at this bound means no friction, and is not a sign of a failed fit.
     frictionless, share = upper if name == "gear_efficiency" else lower, 100.0 * half_width / size
     is_at_bound = min(value - lower, upper - value) <= BOUND_MARGIN * unit
     if is_at_bound and not (name in FRICTION and abs(value - frictionless) <= BOUND_MARGIN * unit):
@@ -273,12 +274,12 @@ def _verdict(
 def _widen_by_constant(
     estimates: list[Estimate], constant: Estimate, known: Mapping[str, float]
 ) -> list[Estimate]:
-    """Widen the intervals of a shaft by that of a fitted constant of the winding."""
+    """Widen the intervals of a shaft by the interval of a constant of the winding."""
     widened: list[Estimate] = []
     relative = max(constant.high - constant.value, constant.value - constant.low) / max(
         constant.value, 1e-12
     )
-    # A known torque or inertia fixes the scale of all torques. The constant has no effect on it.
+    # A known torque or inertia fixes the scale of all torques, independently of the constant.
     has_torque_scale = "mgl" in known or "inertia" in known
     for estimate in estimates:
         is_independent = estimate.name in ("gear_efficiency", "stribeck_speed") or (
@@ -306,9 +307,9 @@ def _widen_by_constant(
 
 
 def _update_status(estimates: list[Estimate]) -> list[Estimate]:
-    """Return estimates whose status corresponds to their widened intervals.
+    """Return the estimates with a status that fits their widened intervals.
 
-    Parameters of friction are judged by the interval of the sum of all friction.
+    Friction parameters are judged by the interval of the total friction.
     """
     shares = {
         estimate.name: (estimate.high - estimate.value) / max(abs(estimate.value), 1e-300)
@@ -338,13 +339,14 @@ def _update_status(estimates: list[Estimate]) -> list[Estimate]:
     return updated
 
 
-def _friction(fit: Fit) -> tuple[float, dict[str, float], dict[str, float]]:
-    """Return the friction of a shaft at the root mean square of its speeds and torques.
+def _total_friction(fit: Fit) -> tuple[float, dict[str, float], dict[str, float]]:
+    """Return the total friction of a shaft at the RMS of its speeds and torques.
 
     Returns:
-        The sum of all friction at the rotor [N*m], its derivatives with respect to the friction
-        parameters, and the value of each parameter that alone would give all friction. For the
-        latter a hundredth of the driving torque is added, because less friction is negligible.
+        The total friction at the rotor [N*m]; its derivatives with respect to the friction
+        parameters; and for each of them the value at which it alone would account for the total
+        friction. The latter includes a hundredth of the driving torque, because less friction is
+        negligible.
     """
     if not isinstance(model := fit.model, ShaftModel):
         return 0.0, {}, {}
@@ -385,7 +387,7 @@ def _friction(fit: Fit) -> tuple[float, dict[str, float], dict[str, float]]:
 def _complete(
     estimates: list[Estimate], known: Mapping[str, float], defaults: Mapping[str, float]
 ) -> list[Estimate]:
-    """Add known parameters, those of a base drive, and parameters that are derived from others."""
+    """Add the known parameters, those of a base drive, and those that follow from others."""
     by_name = {estimate.name: estimate for estimate in estimates}
     for name, value in known.items():
         by_name[name] = Estimate(name, value, value, value, "given")
@@ -442,9 +444,9 @@ def _noise(fit: Fit) -> float:
 
 
 def _inverse(matrix: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Return the inverse of a Gauss-Newton matrix, large but finite along unidentified directions.
+    """Return the inverse of a Gauss-Newton matrix, limited along unidentified directions.
 
-    The normalization keeps the accuracy of parameters with very different standard errors.
+    The matrix is normalized, because the parameters have very different standard errors.
     """
     information = np.diag(matrix) * scales**2
     units = scales / np.sqrt(np.maximum(information, 1e-16 * information.max() + 1e-300))
@@ -466,7 +468,7 @@ def interval_causes(
 
     Args:
         fit: fit to assess.
-        values: linear combinations of the parameters, shape (q,).
+        values: values to assess, linear combinations of the parameters, shape (q,).
         scales: scales of the parameters, shape (p,).
         matrix: derivatives of the combinations with respect to the parameters, shape (q, p).
         seed: seed of the resampling.
@@ -485,17 +487,17 @@ def interval_causes(
     )
     on_step()
     # If an error is proportional to the time step, halving the rate changes the fit by as much as
-    # the error at the full rate. If it grows only with the root of the step, the error is larger
-    # than that change, which is why it is doubled for a winding.
+    # the error at the full rate. If the error grows only with the root of the step, it is larger
+    # than that change. For a winding the change is therefore doubled.
     half_rate_values = _refit_values(fit, [halve_rate(log) for log in fit.logs])
     causes["half_rate"] = (2.0 if is_winding else 1.0) * np.abs(
         matrix @ (half_rate_values - fit.values)
     )
     on_step()
     causes["self_test"] = np.abs(self_test_values - values)
-    # Errors of the input, for example of a voltage that changes between rows, bias its coefficient
-    # toward 0. For a PRBS with a clock of 1 to 4 rows, the relative bias is 2 to 4.6 times the
-    # share of these errors in the variance. A fit at half the rate does not reveal it.
+    # Errors of the input, for example of a voltage that changes between rows, bias the parameters.
+    # For a PRBS with a clock of 1 to 4 rows, the relative bias is 2 to 4.6 times the unexplained
+    # share of the variance. A fit at half the rate does not reveal this bias.
     residual_squares = sum(
         segment.deviation**2 * float(fit.weights(i) @ fit.residuals[i] ** 2)
         for i, segment in enumerate(fit.segments)
@@ -514,10 +516,11 @@ def resampled_half_widths(
 ) -> dict[str, np.ndarray]:
     """Return the half-widths of 95 % intervals by three statistical causes, each of shape (q,).
 
-    `curvature` assumes an exact model and independent residuals, and is a lower limit if there are
-    few stretches. `resampling` refits stretches that are drawn with replacement, each by a
-    Gauss-Newton step. `logs` is two standard deviations of the mean of the logs' separate steps, 0
-    for a single log.
+    - `curvature` assumes an exact model and independent residuals. It is a lower limit if there are
+      few stretches.
+    - `resampling` draws stretches with replacement, and refits each draw by a Gauss-Newton step.
+    - `logs` is two standard errors of the mean of the Gauss-Newton steps of single logs; 0 for one
+      log.
 
     Args:
         fit: fit to assess.
@@ -552,7 +555,7 @@ def resampled_half_widths(
 
 
 def correlations(fit: Fit) -> dict[str, dict[str, float]]:
-    """Return the correlations between parameters; near 1 or -1, two cannot be distinguished."""
+    """Return the correlations; parameters with one near 1 or -1 can hardly be distinguished."""
     names = fit.model.names
     if not names:
         return {}
@@ -568,10 +571,10 @@ def correlations(fit: Fit) -> dict[str, dict[str, float]]:
 def unidentifiable_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, float]]:
     """Return the directions in which the parameters can change without a worse fit.
 
-    The weakest direction follows from the derivatives. Its largest parameter is changed by half its
-    scale, and all others are fitted again: if the fit is then as good, the changes of all
-    parameters are an unidentifiable direction. Derivatives alone do not suffice, because dry
-    friction makes the cost rough, so that a flat direction looks identified.
+    The derivatives give the weakest direction. Its largest parameter is changed by half its scale,
+    and all others are fitted again. If that fit is as good, the changes of all parameters form an
+    unidentifiable direction. Derivatives alone do not suffice: dry friction makes the cost rough,
+    so that a flat direction looks identified.
 
     Args:
         fit: fit to assess.
@@ -582,7 +585,7 @@ def unidentifiable_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, fl
     """
     directions: list[dict[str, float]] = []
     current, sizes = fit, scales
-    # Each direction is found with the largest parameters of the previous directions fixed.
+    # The largest parameter of each direction stays fixed while the next direction is searched.
     while len(current.model.names) > 1 or not directions:
         model, values = current.model, current.values
         matrix = _gauss_newton_sums(current, [segment.block for segment in current.segments])[
@@ -627,8 +630,8 @@ def unidentifiable_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, fl
 def _significant_increase(fit: Fit) -> float:
     """Return the increase of the robust cost that is significant at 95 %.
 
-    Residuals within a block are correlated. The ratio of two estimates of the covariance along the
-    best identified direction, from blocks and from rows, corrects for that.
+    Residuals within a block are correlated. To correct for this, the variance along the best
+    identified direction is estimated from blocks and from rows, and the ratio of both is applied.
     """
     gradients, matrices = _gauss_newton_sums(fit, [segment.block for segment in fit.segments])
     total = matrices.sum(axis=0)
@@ -649,16 +652,16 @@ def _refit_values(fit: Fit, logs: Sequence[Log]) -> np.ndarray:
 def _simulated_logs(fit: Fit, sign: float) -> list[Log]:
     """Simulate the logs of a fit with its residuals as noise, at the resolution of their sensors.
 
-    For a winding, the motion is also replaced by the motion that the fit used. The residuals of
-    each segment keep their order and size, which preserves their correlation, but get a random
-    sign.
+    The residuals of each segment are added in their order, which preserves their correlation, but
+    with a random sign per segment. For a winding, the position is replaced by the integral of the
+    speed that the fit used.
     """
     output, simulate = fit.model.output, fit.model.simulator(fit.values)
     signals = [log.signals[output].copy() for log in fit.logs]
     speeds = [np.zeros(len(log.time)) for log in fit.logs]
     signs = np.random.default_rng(1).choice([-1.0, 1.0], len(fit.segments)) * sign
     for index, segment in enumerate(fit.segments):
-        # Larger residuals are outliers of the logs, and not noise of the sensor.
+        # Larger residuals are outliers, and not noise of the sensor.
         noise = np.clip(fit.residuals[index], -3.0 * fit.scale, 3.0 * fit.scale) * segment.deviation
         signals[segment.log][segment.rows] = (
             simulate(segment, fit.states[index]) + signs[index] * noise

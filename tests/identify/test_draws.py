@@ -94,7 +94,7 @@ def test_a_logged_current_does_not_refuse_parameters_that_the_voltage_determines
         )
         assert more[name].low <= truth <= more[name].high
     assert {trace.part for trace in more.traces} == {"winding", "shaft"}
-    assert any("fitted under the voltage" in text for text in more.warnings)
+    assert any("fitted with the voltage as its input" in text for text in more.warnings)
 
 
 @pytest.mark.matrix

@@ -353,7 +353,7 @@ def test_a_voltage_without_current_determines_only_a_ratio_of_constants(swings):
         ({"rig": "pendulum", "known": {"friction_torque": 1.0}}, r"known\.friction_torque"),
         (
             {"rig": "pendulum", "estimated": ["rotor_inertia"]},
-            r"shaft under a torque estimated\.rotor_inertia",
+            r"shaft driven by a torque estimated\.rotor_inertia",
         ),
         (
             {"rig": "pendulum", "known": {"mgl": 3.6}, "estimated": ["mgl"]},

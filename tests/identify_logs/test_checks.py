@@ -486,6 +486,6 @@ def test_parameters_that_an_excitation_does_not_show_are_reported():
     one_way = simulate(
         make_drive("small"), Excitation("square", 6.0, 0.4, frequency=1.0), Load(1e-4)
     )
-    assert "one way only" in findings_of(one_way, "excitation")[-1].message
+    assert "in one direction only" in findings_of(one_way, "excitation")[-1].message
     silent = replace_signals(one_way, voltage=np.zeros(len(one_way.time)))
     assert "error" in [finding.severity for finding in findings_of(silent, "excitation")]
