@@ -25,7 +25,7 @@ def _fields(cls: type) -> dict[str, dataclasses.Field[Any]]:
 
 
 def value_at(owner: Any, path: str) -> Any:
-    """Return the value at a dotted path; for a word its index, for a part that is None its default."""
+    """Return the value at a dotted path: a word's index, or the default of a part that is None."""
     for name in path.split("."):
         known, value = _fields(family_of(owner)), getattr(owner, name)
         metadata = known[name].metadata if name in known else {}
