@@ -119,7 +119,7 @@ def test_two_motors_have_two_forces_within_their_own_limits():
     [
         ({"actuator": ["lag", series_elastic.SOFT]}, "several families"),
         ({"actuator": ["lag"] * 3}, r"3 actuators, but arm has 2 motors \(shoulder, elbow\)"),
-        ({"actuator": "lag", "physics": "analytic"}, "arm has no counterpart in Gymnasium"),
+        ({"actuator": "lag", "physics": "analytic"}, "arm has no Task.reference_env"),
         (
             {"actuator": "weak"},
             "'weak': is a variation of the paper's actuator, but arm has no such actuator",

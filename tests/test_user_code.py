@@ -141,7 +141,7 @@ MODELS = [
     (
         'name="elbow" axis',
         'type="ball" name="elbow" axis',
-        " has 5 positions and 4 velocities, and slip",
+        " has 5 positions and 4 velocities, but slip",
     ),
     ("<worldbody>", "<worldbdy>", ": XML parse error"),
     (SHOULDER, 'joint="shoulder" gear="5"/', ": actuator 'shoulder': leave out its gear; "),

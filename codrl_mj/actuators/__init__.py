@@ -1,4 +1,4 @@
-"""Actuators, their families, stability and names, as pure functions without MuJoCo."""
+"""Actuator families, their stability and their names, in pure Python without MuJoCo."""
 
 from codrl_mj.actuators.current_loop import (
     CurrentLoop,

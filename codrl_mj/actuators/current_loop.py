@@ -74,8 +74,8 @@ class CurrentLoop(Checked):
     feedback.
     """
     max_voltage: float = real(24.0, above=0.0, unit="V", infinite=True)
-    """Voltage limit u_max [V], > 0; `inf` for none. The paper gives no value: 24 V never saturates
-    with its settings.
+    """Voltage limit u_max [V], > 0; `inf` for none. The paper gives no value: with its
+    settings, the voltage never reaches 24 V.
     """
     bemf_compensation: bool = flag(True)
     """Add kE*omega to the voltage, which cancels the back-EMF unless the voltage saturates. The
@@ -111,7 +111,7 @@ class Supply(Checked):
 
     voltage: float = real(math.inf, above=0.0, unit="V", infinite=True)
     """Open-circuit voltage [V], > 0; the controller's `max_voltage` limits the terminal voltage,
-    too. `inf`: the controller's `max_voltage`.
+    too. `inf`: equal to the controller's `max_voltage`.
     """
     resistance: float = real(0.0, minimum=0.0, unit="ohm")
     """Internal resistance [ohm], >= 0: the available voltage drops by resistance*|current|."""
@@ -177,7 +177,7 @@ def advance(
     for substep in range(substeps):
         sensor_error = parameters.current_bias
         if parameters.current_noise > 0.0:
-            # The callback may be called at intermediate times of a step, so the step's number is
+            # MuJoCo may call the callback at intermediate times of a step, so the step's index is
             # rounded.
             step = int(inputs.time / timestep + 0.5)
             sensor_error += parameters.current_noise * noise.standard_normal(
@@ -317,7 +317,7 @@ class DCMotorActuator(ActuatorModel):
 
     @property
     def assumed(self) -> str:
-        """Default voltage limit if the supply has more; see `ActuatorModel.assumed`."""
+        """Note on a default voltage limit that limits the supply; see `ActuatorModel.assumed`."""
         max_voltage, voltage = (
             self.controller.max_voltage,
             math.inf if self.supply is None else self.supply.voltage,
@@ -386,7 +386,7 @@ class DCMotorActuator(ActuatorModel):
         )
 
     def as_mapping(self) -> dict[str, Any]:
-        """Return the mapping that `actuator_from_mapping` reads, without the default family."""
+        """Return the mapping that `actuator_from_mapping` reads; the default family is left out."""
         return dataclasses.asdict(self) if type(self) is DCMotorActuator else super().as_mapping()
 
 

@@ -39,7 +39,7 @@ class State(NamedTuple):
     housing_rise: float
     """Temperature difference [K] between housing and surroundings."""
     acceleration: float
-    """Acceleration [rad/s^2] of the rotor by the torque of the last step."""
+    """Acceleration [rad/s^2] that the motor's torque gave the rotor in the last step."""
     speed: float
     """Speed [rad/s] of the rotor at the beginning of the last step."""
     external_acceleration: float
@@ -112,7 +112,7 @@ def end_step(
     resistance: float,
     winding: Winding,
     rotor: Shaft,
-    means: StepAverages,
+    averages: StepAverages,
 ) -> tuple[tuple[float, float, float, float, float, float, float, float, float], float]:
     """Return the entries of `State` after a step, and the temperature [degC] of the winding.
 
@@ -121,9 +121,9 @@ def end_step(
     """
     if shaft.has_thermal_model(parameters):
         heat = shaft.rises_after(
-            parameters, timestep, heat, resistance * means.current * means.current
+            parameters, timestep, heat, resistance * averages.current * averages.current
         )
-    acceleration = means.torque / rotor.inertia
+    acceleration = averages.torque / rotor.inertia
     remaining = winding.current, winding.integral, winding.pending, heat.winding, heat.housing
     return (
         *remaining,
@@ -139,7 +139,7 @@ def _advance(
 ) -> tuple[State, float, Signals]:
     """Advance a drive by one step, under a desired torque or, if not `closed`, a voltage.
 
-    A desired torque of kT stands for 1 V.
+    A voltage is passed as a desired torque: kT stands for 1 V.
     """
     command = inputs.desired_torque / parameters.torque_constant
     winding, heat, rotor = begin_step(parameters, timestep, state, inputs)
@@ -148,27 +148,27 @@ def _advance(
         limit_current(parameters, timestep, heat, resistance, command) if closed else command
     )
     samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
-    winding, _, means = shaft.advance_motor(
+    winding, _, averages = shaft.advance_motor(
         parameters, resistance, timestep, samples, winding, rotor, closed, reference
     )
     after, temperature = end_step(
-        parameters, timestep, inputs.time, heat, resistance, winding, rotor, means
+        parameters, timestep, inputs.time, heat, resistance, winding, rotor, averages
     )
-    reported = reference if closed else means.current
+    reported = reference if closed else averages.current
     is_limited, is_thermal = reference != command, abs(reference) < parameters.max_current
     signals = Signals(
-        means.current,
+        averages.current,
         reported,
-        means.voltage,
+        averages.voltage,
         temperature,
-        1.0 if means.saturated > 0.0 or is_limited else 0.0,
-        1.0 if means.saturated > 0.0 else 0.0,
+        1.0 if averages.saturated > 0.0 or is_limited else 0.0,
+        1.0 if averages.saturated > 0.0 else 0.0,
         1.0 if is_limited and not is_thermal else 0.0,
         1.0 if is_limited and is_thermal else 0.0,
-        means.power,
-        means.heat,
+        averages.power,
+        averages.heat,
     )
-    return State(*after), means.torque, signals
+    return State(*after), averages.torque, signals
 
 
 def advance(
@@ -271,7 +271,7 @@ class Drive(ActuatorModel):
 
     @property
     def assumed(self) -> str:
-        """Default supply, current limit, inertia and constants; see `ActuatorModel.assumed`."""
+        """Unspecified supply, current limit, inertia and constants; see `ActuatorModel.assumed`."""
         motor = self.motor
         is_consistent = 0.5 <= motor.back_emf_constant / motor.torque_constant <= 2.0
         missing = {
@@ -311,7 +311,7 @@ class Drive(ActuatorModel):
         """Return the commands `current` [A], within `max_current`, and terminal `voltage` [V]."""
         limit, torque = self.controller.max_current, self.motor.torque_constant
         fixed = dict.fromkeys(
-            ("motor.torque_constant", *ARM), "it would change what an action means"
+            ("motor.torque_constant", *ARM_FIELDS), "it would change what an action means"
         )
         voltage_drive = VoltageDrive(self.motor, self.controller, self.supply)
         bypassed = [
@@ -353,7 +353,7 @@ class Drive(ActuatorModel):
             )
 
     def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
-        """Raise if the back-EMF of a saturated motor makes the speed unstable, or warn.
+        """Raise if the back-EMF of a saturated motor makes the speed unstable; warn if inaccurate.
 
         Raises:
             UnstableError: with the number and a remedy.
@@ -411,7 +411,6 @@ class Drive(ActuatorModel):
         columns = stability.parameter_columns(cls, parameter_values)
         samples = timestep * columns.sample_rate
         valid = (abs(samples - np.round(samples)) <= 1e-6 * samples) & (samples >= 0.5)
-        # These are the combinations that `GearMotor` and `SampledLoop` reject.
         valid &= columns.max_temperature > columns.ambient_temperature
         valid &= columns.bandwidth <= columns.sample_rate / (2.0 * math.pi)
         valid &= np.isinf(columns.max_temperature) | (
@@ -421,7 +420,7 @@ class Drive(ActuatorModel):
         return np.where(valid, _radii(cls, parameter_values), np.inf)
 
 
-ARM = ("motor.gear_ratio", "motor.arm_radius")
+ARM_FIELDS = ("motor.gear_ratio", "motor.arm_radius")
 """Fields that determine how a torque at the rotor acts on the joint."""
 _BYPASSED_BY_VOLTAGE = ("bandwidth", "kp", "ki", "anti_windup", "bemf_compensation", "max_current")
 """Fields of the loop that have no effect if the agent commands the voltage."""

@@ -116,7 +116,8 @@ class GearMotor(Checked):
             0.0251
 
         Args:
-            printed: as for `codrl_mj.catalogue.from_datasheet`, which also explains each number.
+            printed: as for `codrl_mj.catalogue.from_datasheet`, whose documentation explains each
+                value.
 
         Raises:
             ValueError: the datasheet is not sufficient or contradicts itself; the message has
@@ -130,12 +131,12 @@ class GearMotor(Checked):
     def from_motor_parameters(cls, parameters: Any) -> "GearMotor":
         """Return a motor with `codrl_mj.catalogue.MotorParameters`.
 
-        Unknown values become 0, an unknown efficiency 1.
+        An unknown inertia or friction becomes 0; other unknown values become the fields' defaults.
         """
         values = {
             field.name: getattr(parameters, field.name, None) for field in dataclasses.fields(cls)
         }
-        values |= {name: 0.0 for name in _UNKNOWN if values[name] is None}
+        values |= {name: 0.0 for name in _ZERO_IF_UNKNOWN if values[name] is None}
         total_resistance = getattr(parameters, "thermal_resistance", None)
         if values["thermal_resistance_winding"] is None and total_resistance is not None:
             values["thermal_resistance_winding"] = total_resistance - (
@@ -165,5 +166,5 @@ class GearMotor(Checked):
         return self.resistance * self.rotor_inertia / product if product > 0.0 else math.inf
 
 
-_UNKNOWN = ("rotor_inertia", "coulomb_friction", "viscous_friction")
+_ZERO_IF_UNKNOWN = ("rotor_inertia", "coulomb_friction", "viscous_friction")
 """Fields that a datasheet may omit and that then are 0."""

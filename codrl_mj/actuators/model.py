@@ -17,13 +17,13 @@ import numpy as np
 
 from codrl_mj import fields
 from codrl_mj.actuators.parameters import (
-    as_kind,
     family_of,
     field_paths,
     from_values,
     is_arm,
     parameter_paths,
     parameters_type,
+    to_field_type,
     value_at,
 )
 from codrl_mj.user_code import Form, call, check_form, source_location
@@ -67,7 +67,7 @@ class Command(NamedTuple):
     torque_per_unit: float
     """Torque [N*m] at the shaft that corresponds to a command of one unit."""
     limit: float | None
-    """Largest command; None: the command of the task's largest force."""
+    """Largest command; None: the command that corresponds to the task's largest force."""
     fixed: Mapping[str, str]
     """Fields that must not be randomized, with the reason for each."""
 
@@ -101,7 +101,7 @@ class ActuatorModel(fields.Checked):
 
     Fields are created with the functions of `codrl_mj.fields`. A family has a name, declares its
     states and signals as `NamedTuple`s of floats, and defines `advance`. The defaults of all other
-    methods suit an actuator without a gear and without electrics that is stable at any step.
+    methods suit an actuator without gear and winding, which is stable at any step.
 
     Raises:
         ValueError: a field is out of bounds.
@@ -344,10 +344,12 @@ class ActuatorModel(fields.Checked):
             if rest:
                 nested.setdefault(name, {})[rest] = value
             else:
-                changes[name] = as_kind(type(self), name, value)
+                changes[name] = to_field_type(type(self), name, value)
         for name, inner in nested.items():
             owner = value_at(self, name)
-            kinds = {field: as_kind(type(owner), field, value) for field, value in inner.items()}
+            kinds = {
+                field: to_field_type(type(owner), field, value) for field, value in inner.items()
+            }
             changes[name] = dataclasses.replace(owner, **kinds)
         return dataclasses.replace(self, **changes)
 
@@ -370,7 +372,7 @@ class ActuatorModel(fields.Checked):
 
 
 def advance_signature(cls: Family) -> tuple[Form, str]:
-    """Return the structure that `advance` must return, and the names of its declarations."""
+    """Return the structure that `advance` must return, and where it is declared, for messages."""
     return (
         cls.State._fields,
         "torque",

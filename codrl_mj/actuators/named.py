@@ -74,10 +74,9 @@ def mapping_of(actuator: ActuatorModel) -> dict[str, Any] | None:
 def display_name(actuator: ActuatorModel, paper: DCMotorActuator | None = None) -> str:
     """Return the name under which an actuator is displayed.
 
-    This is its label (see `display_label`) if it has one. An actuator without a label is named
-    after the motor of the catalogue with the same values (gear, loop and supply are ignored) if it
-    is a drive; after the matching variation of `paper`, or `custom`, if it is a current loop; and
-    otherwise after its family.
+    This is its label (see `display_label`) if it has one. Without a label, a drive has the name of
+    the catalogue motor with the same values, whatever its gear, loop and supply. A current loop has
+    the name of the matching variation of `paper`, or `custom`. All others have their family's name.
     """
     kind, known = type(actuator), {}
     if kind is DCMotorActuator:
@@ -124,6 +123,7 @@ def is_family(value: Any) -> bool:
 
 
 def _unshared(actuator: ActuatorModel) -> ActuatorModel:
+    """Return a copy that can get a display name; the shared ideal actuator is not copied."""
     return actuator if actuator is IDEAL else copy.copy(actuator)
 
 
@@ -172,9 +172,9 @@ def resolve(actuator: Any, paper: DCMotorActuator | None, owner: str) -> Any:
 
     Args:
         actuator: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file,
-            `module:NAME` of an actuator or a family, a YAML or JSON file of such a mapping, an
-            actuator, a family's class, a mapping of its fields (with a `name`: changes to that
-            actuator; with a `label`: its display name), or None (ideal). Files may be given as a
+            `module:NAME` of an actuator or a family, an actuator, a family's class, a mapping of an
+            actuator's fields (with a `name`: changes to that actuator; with a `label`: its display
+            name), a YAML or JSON file with such a mapping, or None (ideal). Files may be given as a
             `pathlib.Path`.
         paper: the actuator that the names in `NAMED` vary; None if there is none.
         owner: description of the task or environment that gets the actuator, for messages.
@@ -241,10 +241,12 @@ _FILES = (".yaml", ".yml", ".json")
 
 
 def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
-    """Read an actuator's fields from its file, and the `identified` section of `codrl-mj identify`.
+    """Read an actuator's fields, and the `identified` section that `codrl-mj identify` wrote.
 
-    Raises if the file is not a mapping, or if the identification failed: the section then has a
-    `problem`.
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is not a mapping, or the identification failed (its section
+            has a `problem`).
     """
     if not path.is_file():
         raise FileNotFoundError(f"no actuator file at {path}")
@@ -282,13 +284,13 @@ def _from_file(path: Path, paper: DCMotorActuator | None, owner: str) -> Any:
             actuator = resolve(fields, paper, owner)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
-    # Runs save their actuator under a generic file name, so there the folder's name tells more.
+    # Runs save their actuator under a generic file name, so the folder's name becomes the label.
     stem = path.stem if path.stem not in ("actuator", "actuators") else path.absolute().parent.name
     return actuator if display_label(actuator) else set_display_name(_unshared(actuator), stem)
 
 
 def identified_ranges(path: Path | str) -> dict[str, str]:
-    """Return the distributions that `randomize` draws the fields of an identified actuator from.
+    """Return distributions for `randomize`: the identified intervals of an actuator's fields.
 
     Intervals of positive numbers are drawn log-uniformly, so all ratios are equally likely; others
     uniformly.
@@ -382,7 +384,7 @@ def _related_family(family: str, kind: Any) -> Any:
         raise ValueError(
             f"family = {family!r}: cannot replace the family {family_name(kind)!r}, which has"
             f" different fields. Name an actuator of a related family, or leave out the name and"
-            f" specify all fields of the {family!r}. Motors of `codrl-mj motor list` and of"
+            f" specify all fields of family {family!r}. Motors of `codrl-mj motor list` and of"
             " datasheets are drives, which can become servos"
         )
     return related

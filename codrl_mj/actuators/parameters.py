@@ -25,7 +25,7 @@ def _fields(cls: type) -> dict[str, dataclasses.Field[Any]]:
 
 
 def value_at(owner: Any, path: str) -> Any:
-    """Return the value at a dotted path; words are numbers, and a part that is None its default."""
+    """Return the value at a dotted path: a word's index, or the default of a part that is None."""
     for name in path.split("."):
         known, value = _fields(family_of(owner)), getattr(owner, name)
         metadata = known[name].metadata if name in known else {}
@@ -35,7 +35,7 @@ def value_at(owner: Any, path: str) -> Any:
     return owner
 
 
-def as_kind(cls: type, name: str, value: Any) -> Any:
+def to_field_type(cls: type, name: str, value: Any) -> Any:
     """Convert a number to the type of a field; arrays hold integers, flags and words as floats."""
     field = _fields(cls)[name]
     default, options = field.default, field.metadata.get("options", ())
@@ -49,14 +49,16 @@ def as_kind(cls: type, name: str, value: Any) -> Any:
 
 
 def from_values(cls: type, values: Mapping[str, Any], prefix: str = "") -> Any:
-    """Build a dataclass from values by dotted path; parts equal to their default are None."""
+    """Build a dataclass from values by dotted path; an optional part with its defaults is None."""
     nested, values_by_field = fields.parts(cls), {}
     for field in _fields(cls).values():
         if field.name in nested:
             inner = from_values(nested[field.name], values, f"{prefix}{field.name}.")
             values_by_field[field.name] = None if inner == field.metadata.get("absent") else inner
         else:
-            values_by_field[field.name] = as_kind(cls, field.name, values[f"{prefix}{field.name}"])
+            values_by_field[field.name] = to_field_type(
+                cls, field.name, values[f"{prefix}{field.name}"]
+            )
     return cls(**values_by_field)
 
 

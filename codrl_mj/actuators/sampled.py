@@ -11,8 +11,8 @@ P = 1 - exp(-wc*T) and G = P/(1 - e), the commanded voltage is b + R*q,
     q = G*(i_ref - i) + c,
 
 and i - c decays as e^k whether the voltage saturates or not. Unsaturated, q - i_ref decays as (1 -
-P)^k, so the voltage reaches a limit at most once; saturated, i and c approach v as e^k, so it
-leaves the limit at most once.
+P)^k, so the voltage reaches a limit at most once; saturated, i and c approach v as e^k, so the
+voltage leaves the limit at most once.
 
 The energy that the winding draws in a sample is u times the sample's mean current, i + (1 - m)*(v -
 i) with m = (1 - e)*L/(R*T). Unsaturated, with E = i_ref - i and l = i - c, v - i = G*E - l, E+ = (1
@@ -27,8 +27,8 @@ from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 
 _DEFAULT_ANGLE = 2.0 * math.pi * DEFAULT_BANDWIDTH
 """Value of wc*T for a loop without a specified bandwidth."""
-_DEFAULT_STEP = -math.expm1(-_DEFAULT_ANGLE)
-"""Its P, precomputed because `expm1` would take a tenth of a step's time."""
+_DEFAULT_LOOP_DROP = -math.expm1(-_DEFAULT_ANGLE)
+"""P for that angle, precomputed because `expm1` would take a tenth of a step's time."""
 
 
 def designed_gains(
@@ -39,11 +39,11 @@ def designed_gains(
     kp = R*P*e/(1 - e) and ki*T = R*P: the loop from reference to current is P/(z - 1 + P).
     """
     x = resistance * sample_time / inductance
-    step = -math.expm1(-bandwidth * sample_time)
+    loop_drop = -math.expm1(-bandwidth * sample_time)
     # The gain is written with exp(-x), because exp(x) would overflow.
     return (
-        resistance * step * math.exp(-x) / -math.expm1(-x),
-        resistance * step,
+        resistance * loop_drop * math.exp(-x) / -math.expm1(-x),
+        resistance * loop_drop,
     )
 
 
@@ -56,22 +56,24 @@ def solve_designed_loop(
     samples: int,
     x: float,
     y: float,
-    lost: float,
+    drop: float,
 ) -> tuple[float, float, float, float, int]:
     """Advance a designed loop by n samples in closed form, all quantities in amperes.
 
-    The arguments are x = R*T/L, y = wc*T and `lost` = 1 - e; v lies between `low` and `high`.
+    The arguments are x = R*T/L, y = wc*T and `drop` = 1 - e; v lies between `low` and `high`.
 
     The result is i, c, the sum of i over the samples' starts [A], the sum of v times the mean
     current of each sample [A^2], and the number of saturated samples.
     """
-    # The names follow the module's docstring: `step` is P, `gain` G, `rest` e and `rising` 1 - m.
-    step = _DEFAULT_STEP if y == _DEFAULT_ANGLE else -math.expm1(-y)
-    gain, separation = step / lost, lost - step
-    slow_rest, rest, rising = 1.0 - step, 1.0 - lost, 1.0 - lost / x
-    p = (1.0 - gain) * (1.0 - rising * gain) / (step * (1.0 + slow_rest))
-    q = (1.0 + rising * (1.0 - 2.0 * gain) + 2.0 * p * slow_rest * lost) / (lost + step * rest)
-    r = (rising + lost * (p * lost + q * rest)) / (lost * (1.0 + rest))
+    # In the module's docstring, `loop_drop` is P, `gain` is G, `decay` is e and `mean_drop` 1 - m.
+    loop_drop = _DEFAULT_LOOP_DROP if y == _DEFAULT_ANGLE else -math.expm1(-y)
+    gain, separation = loop_drop / drop, drop - loop_drop
+    loop_decay, decay, mean_drop = 1.0 - loop_drop, 1.0 - drop, 1.0 - drop / x
+    p = (1.0 - gain) * (1.0 - mean_drop * gain) / (loop_drop * (1.0 + loop_decay))
+    q = (1.0 + mean_drop * (1.0 - 2.0 * gain) + 2.0 * p * loop_decay * drop) / (
+        drop + loop_drop * decay
+    )
+    r = (mean_drop + drop * (p * drop + q * decay)) / (drop * (1.0 + decay))
     total, drawn, saturated, samples_left = 0.0, 0.0, 0, samples
     while samples_left > 0:
         command = gain * (reference - current) + integral
@@ -83,20 +85,20 @@ def solve_designed_loop(
                 count = samples_until(low - reference, command - reference, y, samples_left)
             error_before, lag = reference - current, current - integral
             slower, faster = math.exp(-count * y), math.exp(-count * x)
-            if abs(separation) > 0.1 * lost or count * abs(x - y) > 50.0:
+            if abs(separation) > 0.1 * drop or count * abs(x - y) > 50.0:
                 # The ratio is (1-P)^k - e^k over their difference for one sample, and is 0/0 where
                 # P = 1 - e. Close to that, `expm1` avoids the cancellation.
                 ratio = (slower - faster) / separation
             elif x != y:
-                ratio = faster * math.expm1(count * (x - y)) / ((1.0 - lost) * math.expm1(x - y))
+                ratio = faster * math.expm1(count * (x - y)) / ((1.0 - drop) * math.expm1(x - y))
             else:
-                ratio = count * faster / (1.0 - lost)
-            error = error_before * slower + lost * lag * ratio
+                ratio = count * faster / (1.0 - drop)
+            error = error_before * slower + drop * lag * ratio
             lag_after = lag * faster
-            errors = (error_before - error + lag - lag_after) / step
+            errors = (error_before - error + lag - lag_after) / loop_drop
             total += count * reference - errors
             drawn += reference * (
-                count * reference - 2.0 * errors + (1.0 + rising) * (error_before - error) / lost
+                count * reference - 2.0 * errors + (1.0 + mean_drop) * (error_before - error) / drop
             )
             drawn += p * (error_before * error_before - error * error) + q * (
                 error_before * lag - error * lag_after
@@ -111,11 +113,11 @@ def solve_designed_loop(
             final = gain * (reference - limit) + limit
             if (final < high) if command > high else (final > low):
                 count = samples_until(limit - final, command - final, x, samples_left)
-            decay = math.exp(-count * x)
-            after = limit + (current - limit) * decay
-            total += count * limit + (current - after) / lost
+            total_decay = math.exp(-count * x)
+            after = limit + (current - limit) * total_decay
+            total += count * limit + (current - after) / drop
             drawn += limit * (count * limit + (current - after) / x)
-            current, integral = after, limit + (integral - limit) * decay
+            current, integral = after, limit + (integral - limit) * total_decay
             saturated += count
         samples_left -= count
     return current, integral, total, drawn, saturated
@@ -143,7 +145,7 @@ def run_samples(
     samples: int,
     resistance: float,
     decay: float,
-    lasting: float,
+    mean_decay: float,
     kp: float,
     ki: float,
 ) -> tuple[float, float, float, float, float, int]:
@@ -151,7 +153,7 @@ def run_samples(
 
     `parameters` are those of a `Drive`, except for the gains: `ki` is the integral gain per sample
     [V/A]. `compensated` is the part of the back-EMF [V] that is added to the voltage, `decay` is e,
-    and `lasting` is m. A delayed loop applies the voltage of the previous sample, `pending`.
+    and `mean_decay` is m. A delayed loop applies the voltage of the previous sample, `pending`.
     Back-calculation has the tracking time kp/ki.
 
     The result is i [A], the integral [V], the pending voltage [V], and then the last three entries
@@ -183,6 +185,6 @@ def run_samples(
             applied = math.copysign(max(abs(applied) - deadband, 0.0), applied)
         total += current
         final = (applied - back_emf) / resistance
-        drawn += final * (final + (current - final) * lasting)
+        drawn += final * (final + (current - final) * mean_decay)
         current = final + (current - final) * decay
     return current, integral, pending, total, drawn, saturated

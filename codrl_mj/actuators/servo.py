@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import drive, shaft, stability
-from codrl_mj.actuators.drive import ARM, Drive
+from codrl_mj.actuators.drive import ARM_FIELDS, Drive
 from codrl_mj.actuators.model import Command, Inputs
 from codrl_mj.actuators.shaft import Shaft, StepAverages
 from codrl_mj.fields import Checked, choice, real
@@ -29,7 +29,7 @@ class ServoLoop(Checked):
     """
 
     controls: str = choice("position", "position", "velocity")
-    """Controlled quantity, which is also what commands mean."""
+    """Controlled quantity, in which commands are given."""
     servo_rate: float = real(1e3, above=0.0, unit="Hz")
     """Sample rate [Hz] of these loops, > 0; it must divide the drive's `sample_rate`, and be a
     multiple or a divisor of the mechanical step's rate.
@@ -117,8 +117,11 @@ class Signals(NamedTuple):
     current_saturated: float
     """1 if the command exceeded `max_current` or `max_torque`."""
     temperature_saturated: float
+    """1 if `max_temperature` limited the current to less than `max_current`."""
     electrical_power: float
+    """Mean electrical power [W] into the winding."""
     copper_loss: float
+    """Mean heat [W] in the winding."""
 
 
 def torque_demand(
@@ -132,8 +135,8 @@ def torque_demand(
 ) -> tuple[float, float]:
     """Return the commanded torque [N*m] at the rotor for one sample, and the integral after it.
 
-    The target [rad] or [rad/s] changes at a `rate` [1/s]; the `period` [s] is that to the next
-    sample.
+    The target is a position [rad] or a speed [rad/s], and `rate` is its time derivative. `period`
+    is the time [s] to the next sample.
     """
     ratio = parameters.gear_ratio
     gain, max_velocity = parameters.velocity_gain / (ratio * ratio), parameters.max_velocity * ratio
@@ -152,9 +155,9 @@ def torque_demand(
 def advance(
     parameters: Any, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Signals]:
-    """Advance all loops by one mechanical step, with predicted speeds between its samples.
+    """Advance all loops by one mechanical step, and predict the speed at each sample within it.
 
-    The input is a position [rad] or a speed [rad/s] of the rotor instead of a desired torque.
+    `inputs.desired_torque` is a commanded position [rad] or speed [rad/s] of the rotor.
     """
     winding, heat, rotor = drive.begin_step(parameters, timestep, state, inputs)
     resistance = shaft.resistance_at(parameters, shaft.temperature_of(parameters, heat))
@@ -174,7 +177,7 @@ def advance(
     amperes, volts, torque, power, loss = 0.0, 0.0, 0.0, 0.0, 0.0
     is_voltage_limited, is_current_limited, is_thermal = 0.0, 0.0, 0.0
     for _ in range(count):
-        # If the servo is faster than the mechanical step, `count` samples lie within it.
+        # If the outer loops are faster than the mechanical step, all `count` passes are samples.
         if steps_to_sample <= 0.0 or count > 1:
             command, integral_after = torque_demand(
                 parameters, period * steps_per_sample, target, rate, position, speed, integral
@@ -184,7 +187,7 @@ def advance(
             integral_after = integral
         desired = min(max(command, -max_torque), max_torque) / constant
         applied = drive.limit_current(parameters, timestep, heat, resistance, desired)
-        # The integral stops while the current is at its limit, unless it would leave the limit.
+        # The integral stops while the current is at its limit, unless this moves it off the limit.
         if applied == command / constant or (integral_after - integral) * command < 0.0:
             integral = integral_after
         if applied != desired and abs(applied) < parameters.max_current:
@@ -192,17 +195,17 @@ def advance(
         elif applied != command / constant:
             is_current_limited = 1.0
         shaft_now = Shaft(rotor.inertia, rotor.external_acceleration, speed)
-        winding, next_speed, means = shaft.advance_motor(
+        winding, next_speed, averages = shaft.advance_motor(
             parameters, resistance, period, samples, winding, shaft_now, True, applied
         )
         position, speed = position + 0.5 * period * (speed + next_speed), next_speed
-        is_voltage_limited += means.saturated
-        amperes, volts = amperes + means.current / count, volts + means.voltage / count
-        torque += means.torque / count
-        power, loss = power + means.power / count, loss + means.heat / count
-    mean = StepAverages(amperes, volts, torque, is_voltage_limited, power, loss)
+        is_voltage_limited += averages.saturated
+        amperes, volts = amperes + averages.current / count, volts + averages.voltage / count
+        torque += averages.torque / count
+        power, loss = power + averages.power / count, loss + averages.heat / count
+    step_averages = StepAverages(amperes, volts, torque, is_voltage_limited, power, loss)
     after, temperature = drive.end_step(
-        parameters, timestep, inputs.time, heat, resistance, winding, rotor, mean
+        parameters, timestep, inputs.time, heat, resistance, winding, rotor, step_averages
     )
     error = (
         target - (inputs.position if parameters.controls == 0.0 else inputs.speed)
@@ -251,7 +254,7 @@ class Servo(Drive):
         return float(f"{10.0 * slope:.3g}")
 
     def with_default_gain(self, loop: Mapping[str, Any]) -> "Servo":
-        """Return this servo with `default_velocity_gain` if a loop's fields have no gain.
+        """Return this servo with `default_velocity_gain`, unless `loop` has a `velocity_gain`.
 
         Raises:
             ValueError: the motor has no back-EMF, so there is no default gain.
@@ -277,7 +280,9 @@ class Servo(Drive):
     def commands(self) -> Mapping[str, Command]:
         """Return the command `position` [rad] or [m], or `velocity` up to no-load speed."""
         loop, motor, arm = self.loop, self.motor, self.arm_radius
-        fixed = dict.fromkeys((*ARM, "loop.controls"), "it would change what an action means")
+        fixed = dict.fromkeys(
+            (*ARM_FIELDS, "loop.controls"), "it would change what an action means"
+        )
         if loop.controls == "position":
             limit, unit = loop.max_position * motor.arm_radius, "rad"
         else:

@@ -1,4 +1,4 @@
-"""Winding, gear and shaft of a drive over some time: the equations shared by `drive` and `servo`.
+"""Equations of a drive's winding, gear and shaft, shared by the families `drive` and `servo`.
 
 Within a mechanical step the shaft's speed changes by the motor's torque, which is known, and by
 everything else that acts on the load. That part, `external_acceleration`, is taken from the
@@ -36,7 +36,7 @@ class TemperatureRises(NamedTuple):
 
 
 class Shaft(NamedTuple):
-    """State of the rotor, and what moves it besides the motor."""
+    """State of the rotor, and its acceleration by everything except the motor."""
 
     inertia: float
     """Total inertia [kg*m^2] that the rotor moves, including its own; `inf` if its speed is held.
@@ -135,7 +135,7 @@ def thermal_limit(
 def inertia_of(parameters: Any, inertia: float) -> float:
     """Return the inertia [kg*m^2] that the rotor moves; `inf` if the speed is held.
 
-    It follows from `load_inertia` if that is specified, and else from the model.
+    It follows from `load_inertia` if that is not 0, and otherwise from the model.
     """
     if parameters.load_inertia > 0.0:
         inertia = parameters.rotor_inertia + parameters.load_inertia / (
@@ -149,9 +149,9 @@ def estimate_external_acceleration(
 ) -> float:
     """Estimate the acceleration [rad/s^2] of the rotor by everything except its motor.
 
-    The estimate is the average of the last step's observation and the previous estimate. Otherwise,
-    two joints that move each other, each with a stiff motor, would react to each other with a delay
-    of a step and oscillate.
+    The estimate is the average of the value observed in the last step and the previous estimate.
+    Without the average, two joints that move each other, each with a stiff motor, would react to
+    each other with a delay of one step and oscillate.
 
     Args:
         timestep: duration of the last step [s].
@@ -165,11 +165,12 @@ def estimate_external_acceleration(
 def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> float:
     """Return the torque [N*m] of Stribeck friction and gear losses by an implicit step.
 
-    It opposes the speed that the shaft would have without it, and is at most the torque that stops
-    the shaft, so it never reverses the rotor. If the inertia is known, it balances any smaller
-    torque: the rotor sticks. If the speed is held, it is at most the torque that stops the rotor
-    alone, and nothing sticks. Source: the friction of Duclusaud, Passault, Padois, Ly, *Extended
-    Friction Models for the Physics Simulation of Servo Actuators* (2024), sec. III.
+    Friction opposes the speed that the shaft would have without it. It is at most the torque that
+    stops the shaft, so it never reverses the rotor; a smaller driving torque is balanced, and the
+    rotor sticks. If the inertia is unknown, so that the speed is held, friction is at most the
+    torque that stops the rotor alone, and nothing sticks. Source: the friction of Duclusaud,
+    Passault, Padois, Ly, *Extended Friction Models for the Physics Simulation of Servo Actuators*
+    (2024), sec. III.
     """
     if shaft.inertia < math.inf:
         free_speed = shaft.speed + duration * (torque / shaft.inertia + shaft.external_acceleration)
@@ -214,24 +215,27 @@ def advance_winding(
             samples, and the means of the power [W] at the terminals and of the heat [W].
     """
     sample_time, voltage = 1.0 / parameters.sample_rate, parameters.supply_voltage
-    stiff = parameters.delayed == 0.0 and parameters.supply_resistance == 0.0
+    is_stiff_and_undelayed = parameters.delayed == 0.0 and parameters.supply_resistance == 0.0
     # A held voltage on a stiff supply makes all samples equal, so they are one long sample.
-    if not closed and stiff:
+    if not closed and is_stiff_and_undelayed:
         sample_time, samples = sample_time * samples, 1
     x = resistance * sample_time / parameters.inductance
-    lost = -math.expm1(-x)
+    drop = -math.expm1(-x)
     back_emf = parameters.back_emf_constant * speed
     compensated = back_emf if parameters.bemf_compensation != 0.0 else 0.0
-    designed = parameters.kp == 0.0 and parameters.ki == 0.0
+    has_designed_gains = parameters.kp == 0.0 and parameters.ki == 0.0
     y = (
         2.0
         * math.pi
         * (parameters.bandwidth * sample_time if parameters.bandwidth > 0.0 else DEFAULT_BANDWIDTH)
     )
-    as_designed = (
-        closed and designed and parameters.anti_windup == 0.0 and parameters.deadband == 0.0
+    has_closed_form = (
+        closed
+        and has_designed_gains
+        and parameters.anti_windup == 0.0
+        and parameters.deadband == 0.0
     )
-    if as_designed and stiff:
+    if has_closed_form and is_stiff_and_undelayed:
         offset = back_emf - compensated
         current, integral, total, drawn, saturated = sampled.solve_designed_loop(
             winding.current,
@@ -242,14 +246,14 @@ def advance_winding(
             samples,
             x,
             y,
-            lost,
+            drop,
         )
         after = Winding(current, integral * resistance + offset, winding.pending)
     else:
         kp, ki = parameters.kp, parameters.ki * sample_time
         if not closed:
             kp, ki, compensated, command = 0.0, 0.0, command, 0.0
-        elif designed:
+        elif has_designed_gains:
             kp, ki = sampled.designed_gains(
                 resistance, parameters.inductance, sample_time, y * parameters.sample_rate
             )
@@ -263,14 +267,14 @@ def advance_winding(
             compensated,
             samples,
             resistance,
-            1.0 - lost,
-            lost / x,
+            1.0 - drop,
+            drop / x,
             kp,
             ki,
         )
         after = Winding(current, integral, pending)
-    change = (after.current - winding.current) / lost
-    mean = (total + (1.0 - lost / x) * change) / samples
+    change = (after.current - winding.current) / drop
+    mean = (total + (1.0 - drop / x) * change) / samples
     stored = (after.current - winding.current) * (after.current + winding.current) / (2.0 * x)
     scale = resistance / samples
     power, heat = back_emf * mean + scale * drawn, scale * (drawn - stored)
@@ -289,9 +293,9 @@ def advance_motor(
 ) -> tuple[Winding, float, StepAverages]:
     """Advance winding, loop and shaft over some time with a held command.
 
-    If a saturated voltage meets a light load, the speed cannot be held: c = h*kT*kE/(R*J) is the
-    share of it that the back-EMF removes in a time h; above 1 it oscillates, above 2 it grows. So
-    the time is divided into 2*c pieces, with a new speed for each.
+    A saturated motor with a light load changes its speed too fast for a speed that is held. The
+    back-EMF removes a share c = h*kT*kE/(R*J) of the speed in a time h: above 1 the speed
+    oscillates, above 2 it grows. So the time is divided into 2*c pieces, each with a new speed.
 
     The result is the winding and the speed [rad/s] afterwards, and the averages.
     """
@@ -300,7 +304,7 @@ def advance_motor(
     viscous = parameters.viscous_friction
     braking = parameters.torque_constant * parameters.back_emf_constant / resistance + viscous
     pieces = min(max(math.ceil(2.0 * duration * braking / shaft.inertia), 1), samples)
-    lossy = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
+    has_losses = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
     amperes, volts, torque, power, heat = 0.0, 0.0, 0.0, 0.0, 0.0
     saturated, samples_left, speed = 0, samples, shaft.speed
     for piece in range(pieces):
@@ -310,7 +314,7 @@ def advance_motor(
         )
         samples_left, saturated = samples_left - count, saturated + limited
         share, delivered = count / samples, parameters.torque_constant * mean
-        if lossy:
+        if has_losses:
             shaft_now = Shaft(shaft.inertia, shaft.external_acceleration, speed)
             delivered -= friction(parameters, share * duration, delivered, shaft_now)
         amperes, volts, torque = (

@@ -32,9 +32,10 @@ class _Unlimited:
 def _closed_loops(
     family: Any, parameter_values: np.ndarray, timestep: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matrices of an electrical step, (to, from, actuator), and the number of steps.
+    """Return the transition matrices of an electrical step, and the number of steps.
 
-    The states are current, integral and error.
+    Matrices have the shape (state after, state before, actuator); the states are current, integral
+    and error. There are `substeps` electrical steps in a mechanical step.
     """
     parameters = parameter_columns(family, parameter_values)
     # A unit matrix of states, for all actuators at once, shape (state, state, actuator): linear
@@ -78,13 +79,13 @@ def spectral_radii(family: Any, parameter_values: np.ndarray, timestep: float) -
 
 
 MARGIN = 1e-9
-"""Relative margin by which Jury's conditions must clearly hold or fail, far above the rounding of
-either method.
+"""Relative margin by which Jury's conditions must hold or fail to decide a case. It is far above
+the rounding errors of either method.
 """
 
 
 def stability_radii(family: Any, parameter_values: np.ndarray, timestep: float) -> np.ndarray:
-    """Return 0 for stable loops, infinity for unstable ones, and spectral radii in doubt.
+    """Return 0 for stable loops, infinity for unstable ones, and the spectral radius if in doubt.
 
     Jury's criterion decides all clear cases, which saves nearly all of the eigenvalues.
 
@@ -114,9 +115,9 @@ def stability_radii(family: Any, parameter_values: np.ndarray, timestep: float) 
 
 
 def spectral_radius(actuator: Any, timestep: float) -> float:
-    """Return the largest absolute eigenvalue of the closed loop; below 1 the loop is stable.
+    """Return the largest absolute eigenvalue of the closed loop over one mechanical step.
 
-    It is taken over one mechanical step.
+    The loop is stable if it is below 1.
 
     Args:
         actuator: motor and gains.
@@ -203,9 +204,7 @@ class Joints(NamedTuple):
 
 
 PERTURBATION = -1e-6
-"""Perturbation added to each state in turn. It is negative so that counters and times stay on the
-side on which a sample is due.
-"""
+"""Perturbation added to each state in turn. It is negative, so a counter that is due stays due."""
 WITHOUT_FRICTION = {"stribeck_friction": 0.0, "gear_efficiency": 1.0, "deadband": 0.0}
 """Parameter values without friction and dead zone, which would hide small motions."""
 
@@ -247,7 +246,7 @@ def linearize(
         after, torque, _ = advance(parameters, timestep, family.State(*states), inputs)
         return np.array([*after, torque])
 
-    # The first period only brings counters and times into their periodic pattern.
+    # The first period is not recorded: it only makes counters and times periodic.
     for step in range(2 * period):
         time, point = step * timestep, np.append(state, [0.0, 0.0])
         rest = advanced(point, time)
@@ -287,8 +286,8 @@ def loop_radius(joints: Joints, loops: Sequence[np.ndarray], timestep: float) ->
         product = matrix @ product
     if not np.isfinite(product).all():
         return math.inf
-    # A state other than a speed that nothing else reads, or that nothing else changes, is not part
-    # of a loop and is removed.
+    # States that no other state reads, or that no other state changes, are not part of a loop and
+    # are removed. Speeds always remain.
     live, coupled = (
         np.ones(len(product), dtype=bool),
         (product != 0.0) & ~np.eye(len(product), dtype=bool),

@@ -27,7 +27,7 @@ def advance(
     state: Empty,  # noqa: ARG001
     inputs: Inputs,
 ) -> tuple[Empty, float, Signals]:
-    """Clip the desired torque to the torque-speed line, and the line to `max_torque`.
+    """Clip the desired torque to the torque-speed line, and to `max_torque`.
 
     At speed w, full forward voltage gives stall_torque*(1 - w/no_load_speed), and full backward
     voltage stall_torque*(-1 - w/no_load_speed). Where the line exceeds +-max_torque it is cut off:

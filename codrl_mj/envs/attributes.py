@@ -40,7 +40,7 @@ def read(name: str, setup: ResolvedEnv, model: Any) -> Any:
     if isinstance(attribute, Fixed):
         return attribute.value
     if isinstance(attribute, Derived):
-        return attribute.of(*(read(source, setup, model) for source in attribute.names))
+        return attribute.function(*(read(source, setup, model) for source in attribute.names))
     if isinstance(attribute, Setting):
         value = getattr(
             setup.simulation if attribute is Setting.INTEGRATOR else setup.task, attribute.value

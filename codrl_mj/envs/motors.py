@@ -24,7 +24,7 @@ from codrl_mj.envs.randomization import (
     check_extremes,
 )
 from codrl_mj.physics.base import divergence_error, make_info_reader
-from codrl_mj.physics.variation import without_motors, write_fields
+from codrl_mj.physics.variation import without_additions, write_fields
 
 # In MuJoCo's list of warnings, BADQPOS, BADQVEL, BADQACC and BADCTRL are neighbors in this order.
 _POSITION = int(mujoco.mjtWarning.mjWARN_BADQPOS)
@@ -113,7 +113,7 @@ class ActuatorBank:
             for index in nominal
         ]
         distributions, timestep = parse_randomize(settings.randomize), model.opt.timestep
-        bare_model = without_motors(model, nominal) if distributions else model
+        bare_model = without_additions(model, nominal) if distributions else model
         randomization = Randomization(
             distributions,
             bare_model,

@@ -6,7 +6,7 @@ import re
 import mujoco
 
 NEWEST_DM_CONTROL_WITHOUT_MUJOCO_4 = (1, 0, 50)
-"""Newest dm_control that reads fields which MuJoCo 4 removed (`MjModel.flex_vertedge`)."""
+"""Newest known dm_control that needs MuJoCo 3: it reads `MjModel.flex_vertedge`."""
 
 
 def check_dm_control() -> None:
@@ -19,12 +19,12 @@ def check_dm_control() -> None:
         importlib.metadata.PackageNotFoundError: dm_control is not installed.
     """
     version = importlib.metadata.version("dm-control")
-    numbers = tuple(int(number) for number in re.findall(r"\d+", version)[:3])
+    release = tuple(int(number) for number in re.findall(r"\d+", version)[:3])
     if (
         int(mujoco.__version__.partition(".")[0]) >= 4
-        and numbers <= NEWEST_DM_CONTROL_WITHOUT_MUJOCO_4
+        and release <= NEWEST_DM_CONTROL_WITHOUT_MUJOCO_4
     ):
         raise RuntimeError(
             f"dm_control {version} does not work with MuJoCo {mujoco.__version__}: it needs MuJoCo"
-            " 3. pip install 'codrl-mj[dm-control]' installs one that fits"
+            " 3; pip install 'codrl-mj[dm-control]' installs versions that fit together"
         )

@@ -15,7 +15,10 @@ from codrl_mj.tasks import TASKS
 
 
 class ModelPatcher:
-    """Adds motors to models that are built later, and records the names in these models."""
+    """Patch of MuJoCo's XML loaders that adds motors to every model they build.
+
+    It records the names in these models, so that `check` can report a pattern without a match.
+    """
 
     def __init__(
         self,
@@ -34,14 +37,13 @@ class ModelPatcher:
         """Add motors to every model that this thread builds from XML in a `with` block."""
         token = _ACTIVE_PATCHER.set(self)
         with _LOCK:
-            for name, spec in _SPEC_READERS.items() if not _OPEN_BLOCKS else ():
-                _ORIGINAL_LOADERS.callback(
-                    setattr, mujoco.MjModel, name, vars(mujoco.MjModel)[name]
-                )
+            # The first open block of any thread replaces the loaders; the last one restores them.
+            for name, read_spec in _SPEC_READERS.items() if not _OPEN_BLOCKS else ():
+                _LOADER_RESTORER.callback(setattr, mujoco.MjModel, name, vars(mujoco.MjModel)[name])
                 setattr(
                     mujoco.MjModel,
                     name,
-                    staticmethod(_patched_loader(getattr(mujoco.MjModel, name), spec)),
+                    staticmethod(_patched_loader(getattr(mujoco.MjModel, name), read_spec)),
                 )
             _OPEN_BLOCKS.append(self)
         try:
@@ -50,17 +52,17 @@ class ModelPatcher:
             with _LOCK:
                 _OPEN_BLOCKS.remove(self)
                 if not _OPEN_BLOCKS:
-                    _ORIGINAL_LOADERS.close()
+                    _LOADER_RESTORER.close()
             _ACTIVE_PATCHER.reset(token)
 
     def motors_added(
-        self, model: mujoco.MjModel, spec: Callable[[], mujoco.MjSpec]
+        self, model: mujoco.MjModel, read_spec: Callable[[], mujoco.MjSpec]
     ) -> mujoco.MjModel:
         """Return a model with the motors that match it; the same model if none match.
 
         Args:
             model: the model without motors.
-            spec: function that reads the model's spec.
+            read_spec: function that reads the model's spec.
 
         Raises:
             ValueError: see `codrl_mj.add_motors`.
@@ -85,12 +87,12 @@ class ModelPatcher:
                     f" {type(actuator).__name__} takes motions; must be"
                     f" {' or '.join(actuator.commands())}"
                 )
-        # The model without motors has already been built with MuJoCo's warnings about it; those of
-        # the second build would only repeat them.
+        # Building the model without motors has already shown MuJoCo's warnings about it; the second
+        # build would repeat them.
         with warnings.catch_warnings():
             own_modules = r"codrl_mj\.(engine\.specs|external_envs\.building)"
             warnings.filterwarnings("ignore", category=UserWarning, module=own_modules)
-            return add_motors(spec(), matching, *self._add_motors_arguments).compile()
+            return add_motors(read_spec(), matching, *self._add_motors_arguments).compile()
 
     def check(self, env_id: str = "") -> None:
         """Raise if a pattern matched nothing, or if no model was built from XML.
@@ -100,7 +102,7 @@ class ModelPatcher:
         if not self._names_of_models and env_id:
             task = next((task.name for task in TASKS.values() if task.gymnasium_id == env_id), None)
             remedy = (
-                f"use {task!r}, the task of this package that has motors"
+                f"use this package's task {task!r}, which has motors"
                 if task
                 else "only environments with such a model can get motors"
             )
@@ -153,7 +155,7 @@ def motors_added(
 
 
 _ACTIVE_PATCHER: contextvars.ContextVar[ModelPatcher | None] = contextvars.ContextVar(
-    "present", default=None
+    "active_patcher", default=None
 )
 """Patcher of the innermost block of this thread."""
 
@@ -167,15 +169,16 @@ _SPEC_READERS: dict[str, Callable[..., mujoco.MjSpec]] = {
     ),
 }
 """MuJoCo's functions that build a model from XML -> readers of its spec with the same arguments."""
-_LOCK, _ORIGINAL_LOADERS = threading.Lock(), contextlib.ExitStack()
+_LOCK, _LOADER_RESTORER = threading.Lock(), contextlib.ExitStack()
+"""Lock of the two following objects, and the stack that restores MuJoCo's functions."""
 _OPEN_BLOCKS: list[ModelPatcher] = []
-"""Blocks of all threads; while there are any, MuJoCo's functions are replaced."""
+"""Patchers of the open blocks of all threads; while there are any, the loaders are replaced."""
 
 
 def _patched_loader(
     original: Callable[..., mujoco.MjModel], read_spec: Callable[..., mujoco.MjSpec]
 ) -> Callable[..., mujoco.MjModel]:
-    """Return a replacement of one of MuJoCo's functions, which adds motors to the loaded model."""
+    """Return a replacement for a loader of MuJoCo that adds motors to the loaded model."""
 
     # MuJoCo's functions are replaced for all threads; the context variable restricts the motors to
     # the thread of the block.

@@ -21,10 +21,11 @@ from codrl_mj.fields import did_you_mean
 
 
 class MotorsAddedEnvironment(dm_env.Environment):
-    """A dm_control environment that builds all its models with motors; it has all its attributes.
+    """Wrapper of a dm_control environment that adds motors to every model that it builds.
 
-    The order of stepping stays dm_control's: by default `mj_step2` before `mj_step1`, so `signals`
-    are those of the forces that acted in the last completed step.
+    All other attributes, such as `physics` and `task`, are those of the environment. The order of
+    stepping is dm_control's: by default `mj_step2` runs before `mj_step1`, so `signals` belong to
+    the forces that acted in the last completed step.
     """
 
     def __init__(
@@ -54,7 +55,8 @@ class MotorsAddedEnvironment(dm_env.Environment):
         self._generator = np.random.default_rng(noise_seed)
         self._ended = True
         self._bound: tuple[mujoco.MjModel, ActuatorBank] | None = None
-        # The property raises here, and not later, if the motors do not fit the environment.
+        # If the motors do not fit the environment, the property raises now and not at the first
+        # step.
         _ = self._bank
 
     def reset(self) -> dm_env.TimeStep:
@@ -73,7 +75,7 @@ class MotorsAddedEnvironment(dm_env.Environment):
         Raises:
             ValueError: the shape of the action is not that of the action specification.
             SimulationDivergedError: a value of the simulation is not finite, and the environment
-                itself does not end the episode then.
+                does not end the episode for this reason.
         """
         if self._ended:
             return self.reset()
@@ -151,7 +153,7 @@ class MotorsAddedEnvironment(dm_env.Environment):
         self._environment.close()
 
     def __getattr__(self, name: str) -> Any:
-        """Return another attribute of the environment, such as `physics` or `task`."""
+        """Return any other attribute from the wrapped environment, such as `physics` or `task`."""
         if name.startswith("__") or name == "_environment":
             raise AttributeError(name)
         return getattr(self._environment, name)
@@ -169,12 +171,12 @@ def make_dm_control(
     noise_seed: int | None = None,
     **options: Any,
 ) -> MotorsAddedEnvironment:
-    """Create a dm_control environment, or another of its interface, with motors.
+    """Create an environment of dm_control, or another `dm_env.Environment`, with motors.
 
         >>> motors = {".*": "maxon-ec45-flat-50w"}
         >>> env = codrl_mj.make_dm_control("cheetah/run", motors, task_kwargs={"random": 1})
 
-    With `"ideal"` actuators it is bit for bit the environment without them.
+    With `"ideal"` actuators it behaves bit for bit like the environment without motors.
 
     Args:
         environment: `DOMAIN/TASK` of the suite, or a function that makes an environment.
@@ -194,10 +196,16 @@ def make_dm_control(
         RuntimeError: dm_control does not work with the installed MuJoCo.
     """
     check_dm_control()
-    resolved = resolve_patterns(actuators, "a dm_control environment")
-    disturbed = resolve(disturbances, NO_DISTURBANCES)
+    resolved_actuators = resolve_patterns(actuators, "a dm_control environment")
+    resolved_disturbances = resolve(disturbances, NO_DISTURBANCES)
     settings = MotorSettings(
-        resolved, action, False, randomize, disturbed, allow_unstable, joint_dynamics
+        resolved_actuators,
+        action,
+        False,
+        randomize,
+        resolved_disturbances,
+        allow_unstable,
+        joint_dynamics,
     )
     if not isinstance(environment, str):
         return MotorsAddedEnvironment(lambda: environment(**options), settings, noise_seed)

@@ -44,24 +44,25 @@ def make(
     joint_dynamics: str | None = None,
     **options: Any,
 ) -> "MotorsAddedEnv":
-    """Create a Gymnasium environment, or another registered with it, with motors.
+    """Create a Gymnasium environment, built-in or third-party, with motors.
 
     With `"ideal"` actuators it is bit for bit the environment that `gymnasium.make` makes.
 
     Args:
-        env_id: the id; or a function, or class, that makes an environment, which needs no id.
+        env_id: the id; or a function or class that makes the environment, registered or not.
         actuators: pattern of actuators' names -> actuator, as for `codrl_mj.add_motors`.
-        action: `force`: the environment's own actions, whose forces are the desired ones (a
-            position servo stays one); or another command of the actuators, such as `current` and
-            `voltage`, whose limits become the action space. The environment still computes its
-            costs from its own controls: from the torque of a current, or from the number of volts.
+        action: `force` to keep the environment's actions; the forces that they cause in the model
+            become the motors' desired forces (a position servo remains a position servo). Or
+            another command of the actuators, such as `current` or `voltage`, whose limits become
+            the action space. The environment still computes its costs from the model's controls:
+            for a current from the corresponding torque, for a voltage from the number of volts.
         observe_actuator: True to append the motors' sensor values to the observation, motor by
             motor.
-        randomize: path -> distribution (or its text), drawn at every reset: FIELD of all motors,
-            PATTERN:FIELD of those of a pattern, and of the model `model.mass.BODY`,
-            `model.gravity` and `model.damping.JOINT`; or pattern -> field -> distribution. The
-            drawn values are in the reset's info, `randomization`. The generator is not the
-            environment's, whose initial states therefore do not change.
+        randomize: path -> distribution (or its text), drawn at every reset. Paths are FIELD for all
+            motors, PATTERN:FIELD for the motors that a pattern matches, and `model.mass.BODY`,
+            `model.gravity` and `model.damping.JOINT` for the model. Alternatively, pattern -> field
+            -> distribution. The drawn values are in the reset's info, `randomization`. A separate
+            generator draws them, so the environment's initial states do not change.
         disturbances: delay, quantum and rate of the commands, and load pulses, once per environment
             step: see `codrl_mj.Disturbances`. They act on a plain motor's force [N or N*m] before
             the gear, and on the control of other actuators.
@@ -111,7 +112,7 @@ class MotorsAddedCreator:
     """Callable that makes an environment with motors, in place of the original entry point."""
 
     creator: Any
-    """Original class or function, which makes it without motors."""
+    """Original class or function, which makes the environment without motors."""
     settings: MotorSettings
     """Settings of the motors."""
     env_id: str
@@ -134,26 +135,26 @@ class MotorsAddedCreator:
         patcher.check(self.env_id)
         base: Any = env.unwrapped
         env_class: Any = type(base)
-        # The class is exchanged on the existing object: the original creator, which may be a
-        # function, decides on the class and on the wrappers around it.
+        # The class of the existing object is replaced, because only the original creator, which may
+        # be a function, knows the class and the wrappers around it.
         if issubclass(env_class, MujocoEnv):
             base.__class__, base.recreate = (
                 _class_with_motors(env_class),
-                functools.partial(self.base, **options),
+                functools.partial(self.make_unwrapped, **options),
             )
         return env
 
-    def base(self, **options: Any) -> gymnasium.Env:
+    def make_unwrapped(self, **options: Any) -> gymnasium.Env:
         """Make the environment, without wrappers."""
         return self(**options).unwrapped
 
 
 @functools.cache
 def _class_with_motors(env_class: Any) -> Any:
-    """Return a subclass that brings motors to rest with the state, and keeps motors in copies.
+    """Return a subclass whose `set_state` brings the motors to rest, and whose copies have motors.
 
     Gymnasium's environments copy and pickle themselves by calling their constructor again, which
-    knows nothing of motors.
+    would build the model without motors.
     """
 
     class WithMotors(env_class):
@@ -179,9 +180,9 @@ def _class_with_motors(env_class: Any) -> Any:
 class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
     """Wrapper that `make` puts around an environment that was built with motors.
 
-    Every step's `info` has `desired_force` and `actual_force` [N or N*m], at the motors' side of
-    the model's gears, the signals of the actuators' families and `saturated`, at the end of the
-    step; for several motors arrays (n_motors,) in the model's order.
+    The `info` of every step has values at its end: `desired_force` and `actual_force` [N or N*m],
+    both on the motors' side of the model's gears, the signals of the actuators' families, and
+    `saturated`. For several motors they are arrays (n_motors,) in the model's order.
     """
 
     def __init__(self, env: gymnasium.Env) -> None:
@@ -228,7 +229,7 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
 
     @property
     def recorder(self) -> SubstepRecorder:
-        """Reader of the state between steps; its first use starts recording integration steps."""
+        """Recorder of integration steps; it starts recording when the property is first read."""
         if self._recorder is None:
             dt = getattr(self.unwrapped, "dt", None)
             self._recorder = SubstepRecorder(
@@ -296,10 +297,10 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays: simulation, motors, generators, draws, time limit.
 
-        It has MuJoCo's state and the arrays computed from it, which observations and rewards read;
-        not the environment's own attributes, nor counts of wrappers except `TimeLimit`. An
-        environment that is not a Gymnasium `MujocoEnv` may store its state anywhere: its snapshot
-        has only the generators, and `restore` starts an episode.
+        The snapshot contains MuJoCo's state, and the arrays computed from it that observations and
+        rewards read. It does not contain attributes of the environment, or counters of wrappers
+        other than `TimeLimit`. An environment that is not a Gymnasium `MujocoEnv` may store its
+        state anywhere: its snapshot has only the generators, and `restore` starts an episode.
         """
         return {
             "environment": encode_name(self._id),
@@ -340,7 +341,7 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         return isinstance(self.unwrapped, MujocoEnv)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return all but what belongs to the model, which a copied environment builds again."""
+        """Return all attributes except those tied to the model, which a copy builds again."""
         return {
             name: value
             for name, value in self.__dict__.items()
@@ -348,10 +349,10 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore in this or another process; as with Gymnasium's environments, reset the copy."""
+        """Restore in this or another process; the copy must then be reset, as in Gymnasium."""
         self.__dict__.update(state, _was_reset=False)
         base = self.unwrapped
-        # MuJoCo copies data together with a model of its own.
+        # Copied data have their own copy of the model, which the environment must use, too.
         if base.model is not base.data.model:  # type: ignore[attr-defined]
             base.model = base.data.model  # type: ignore[attr-defined]
         self._bind()

@@ -38,8 +38,8 @@ class GymnasiumEnvSource(EnvSource):
             return gymnasium.spec(self.name.rpartition(":")[2])
         except (gymnasium.error.Error, ModuleNotFoundError) as error:
             raise ValueError(
-                f"task = {self.name!r}: {error}; environments of packages that Gymnasium does not"
-                " load by itself are named module:ID"
+                f"task = {self.name!r}: {error}; if Gymnasium does not load the environment's"
+                " package by itself, write module:ID"
             ) from None
 
     @property
@@ -48,7 +48,7 @@ class GymnasiumEnvSource(EnvSource):
         return self.spec.max_episode_steps
 
     def code(self, options: Any) -> set[str | Path]:
-        """Return modules of its class and its registration, and files among its options."""
+        """Return the modules of the class and of the registration, and files named in options."""
         modules = getattr(self._creator, "__module__", ""), self.name.rpartition(":")[0]
         return super().code(options) | {name for name in modules if name}
 
@@ -63,7 +63,7 @@ class GymnasiumEnvSource(EnvSource):
         """Make an environment.
 
         Raises:
-            ValueError: see `codrl_mj.make`; or its episodes may never end.
+            ValueError: see `codrl_mj.make`; or there is no time limit, so episodes may never end.
         """
         from codrl_mj.external_envs.environments import make
 
@@ -96,7 +96,7 @@ class GymnasiumEnvSource(EnvSource):
             raise ValueError(f"{subject}: {error}") from error
 
     def view(self, config: Any, width: int, height: int, camera: str | None) -> dict[str, Any]:
-        """Return arguments for this size [px] and camera if it is a `MujocoEnv` of Gymnasium's."""
+        """Return arguments for a size [px] and camera, which a Gymnasium `MujocoEnv` accepts."""
         from gymnasium.envs.mujoco import MujocoEnv
 
         if not (isinstance(self._creator, type) and issubclass(self._creator, MujocoEnv)):
@@ -120,4 +120,4 @@ def claims(name: str) -> bool:
 
 
 find = functools.cache(GymnasiumEnvSource)
-"""Function that returns the source of an id; an id is always the same object."""
+"""Function that returns the env source of an id, always the same object for the same id."""

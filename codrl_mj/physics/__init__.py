@@ -1,7 +1,8 @@
-"""Simulations of a task, in MuJoCo or with Gymnasium's analytic dynamics, behind one interface.
+"""Simulations of a task behind one interface: in MuJoCo, or by analytic equations of motion.
 
 Read `base`, then `mjcf` (actuators in the model), `stepping` (a compiled step) and `mujoco_single`.
-Many simulations are rows of arrays that several threads step: `rows`, `sharing`, `mujoco_batch`.
+Batches store many simulations as rows of arrays, which several threads step: `rows`, `sharing` and
+`mujoco_batch`.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Simulation of a task by the unmodified Gymnasium environment, with arbitrary forces."""
+"""Simulation of a task by its reference: unmodified Gymnasium, or equations in closed form."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,14 +10,14 @@ from codrl_mj.physics.base import Physics, SimulationConfig
 
 
 class AnalyticPhysics(Physics):
-    """A task simulated by Gymnasium's own equations."""
+    """Simulation of a task by the equations of motion of its `Task.reference_env`."""
 
     def __init__(self, simulation: SimulationConfig) -> None:
-        """Create the task's Gymnasium environment.
+        """Create the task's reference environment.
 
         Raises:
-            ValueError: something is added to the joint, for which Gymnasium's equations have no
-                term; or the task has no Gymnasium environment.
+            ValueError: an actuator or `joint` adds inertia or friction, for which the equations
+                have no term; or the task has no reference environment.
         """
         actuator_additions = [
             (f"the {type(actuator).__name__}'s ", actuator.additions)
@@ -33,7 +33,7 @@ class AnalyticPhysics(Physics):
         task = simulation.task
         if task.reference_env is None:
             raise ValueError(
-                f"physics = 'analytic': {task.name} has no counterpart in Gymnasium; use 'mujoco'"
+                f"physics = 'analytic': {task.name} has no Task.reference_env; use 'mujoco'"
             )
         super().__init__(simulation)
         self.timestep = simulation.timestep
@@ -115,8 +115,8 @@ class AnalyticPhysics(Physics):
     def snapshot(self) -> np.ndarray:
         """Return state, actuators, time and key as a vector, shape (k,), float64.
 
-        It does not include `memory` and changes by `set_actuators`. Gymnasium's environment has no
-        other state.
+        It includes neither `memory` nor changes by `set_actuators`. The reference environment has
+        no other state.
         """
         states = [value for state in self._states for value in state]
         return np.array([*self.state, *states, self.time, self._key], dtype=np.float64)

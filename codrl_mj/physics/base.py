@@ -23,8 +23,8 @@ are numbers for a task with one actuator and arrays (n,) for several; a batch ad
 def trace_names(family: Family) -> tuple[str, ...]:
     """Return the columns of `Physics.trace`.
 
-    They are the force [N or N*m] commanded to the actuator in an integration step, after
-    disturbances of the command, the force delivered in it, the family's signals at its end, and the
+    For an integration step these are the force [N or N*m] that is commanded to the actuator, after
+    disturbances; the force that it delivers; the family's signals at the end of the step; and the
     velocity of the actuated joint [m/s or rad/s] at its end.
     """
     return ("desired_force", "actual_force", *family.Signals._fields, "speed")
@@ -39,8 +39,8 @@ def signal_names(family: Family) -> tuple[str, ...]:
 def make_info_reader(names: tuple[str, ...]) -> Callable[[Any], Signals]:
     """Return a function that turns a trace's columns, numbers or arrays, into `Signals`.
 
-    The last entry is the flag `saturated`; if the family has no such signal, it is False in the
-    columns' shape.
+    The last entry is the flag `saturated`. For a family without this signal, it is False, with the
+    shape of a column.
     """
     # The dictionary is generated as source text, as `namedtuple` does: a loop would take a tenth of
     # an environment's step.
@@ -117,7 +117,10 @@ class SimulationConfig:
         return self.task.step_duration / self.inner_steps
 
     def holding_forces(self, states: np.ndarray) -> np.ndarray:
-        """Return the desired forces (m, n) that hold states (m, s); 0 for force commands."""
+        """Return the desired forces (m, n) that hold the positions in states (m, s).
+
+        They are 0 where commands are forces and not positions.
+        """
         task = self.task
         positions = states[:, [task.qpos[task.qvel.index(speed)] for speed in task.speed_indices]]
         return np.where(self.force_per_position != 0.0, self.force_per_position * positions, 0.0)
@@ -174,7 +177,8 @@ class Physics(abc.ABC):
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Replace the actuators by others of their family; a reset must follow.
 
-        Quantities that they add to their joints belong to the model: see `set_model`.
+        The inertia and friction that they add to their joints are fields of the model, which this
+        does not change: see `set_model`.
         """
 
     def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
@@ -211,9 +215,9 @@ class Physics(abc.ABC):
 
     @abc.abstractmethod
     def snapshot(self) -> np.ndarray:
-        """Return simulation and actuators as a vector, shape (k,), float64, without `memory`.
+        """Return the state of simulation and actuators as a vector, shape (k,), float64.
 
-        Replaced parameters are not included either.
+        It includes neither `memory` nor changes by `set_actuators` and `set_model`.
         """
 
     @abc.abstractmethod
@@ -276,7 +280,7 @@ def divergence_error(
 ) -> SimulationDivergedError:
     """Return the error of a simulation that diverged at a time [s].
 
-    `step_setting` is the name of the setting of its integration step.
+    `step_setting` names the setting that determines its integration step.
     """
     return SimulationDivergedError(
         f"{name}: the simulation diverged at t = {time:g} s: {invalid_entries}. Reset the"

@@ -1,8 +1,7 @@
-"""Compiled functions of a task: its outcomes, its bounds, and the order of its state.
+"""Compiled functions of a task: outcomes, bounds, and the conversion of MuJoCo's state.
 
-Observation, reward and termination have one compiled form that all environments call, because the
-cosine of one library may differ from that of another in the last bit. Functions of MuJoCo's `qpos`
-and `qvel` take them as pointers or as arrays.
+All environments call the same compiled observation, reward and termination, because the cosines of
+two libraries may differ in the last bit. `qpos` and `qvel` may be pointers or arrays.
 """
 
 import functools
@@ -24,7 +23,7 @@ Compiled = Callable[..., Any]
 
 @functools.cache
 def compiled_reader(positions: tuple[int, ...], velocities: tuple[int, ...]) -> Compiled:
-    """Return (qpos, qvel, state (n,)) -> None, which fills `state` in the task's order."""
+    """Return a function (qpos, qvel, state (n,)) -> None that fills `state` in the task's order."""
 
     @internal
     def read(qpos: Any, qvel: Any, state: np.ndarray) -> None:
@@ -43,10 +42,11 @@ def compiled_constrain(
     positions: tuple[int, ...],
     velocities: tuple[int, ...],
 ) -> Compiled | None:
-    """Return (qpos, qvel, scratch (n,), step [s]) -> None, which applies `constrain` in place.
+    """Return a function (qpos, qvel, scratch (n,), timestep [s]) -> None that applies `constrain`.
 
-    The result is None for a task without bounds. If an entry of the state exceeds `MAX_STATE`, all
-    entries become NaN, because the bounds would otherwise make a diverged state look valid.
+    It changes `qpos` and `qvel` in place. The result is None for a task without bounds. If an entry
+    of the state exceeds `MAX_STATE`, all entries become NaN, because the bounds would otherwise
+    make a diverged state look valid.
     """
     if constrain is None:
         return None
@@ -86,15 +86,15 @@ class Outcomes(NamedTuple):
     """
 
     observe: Compiled
-    """(state, observation) -> None, which fills the observation."""
+    """Function (state, observation) -> None that fills the observation."""
     reward: Compiled
-    """(state before, delivered force, state after, options) -> reward."""
+    """Function (state before, delivered force, state after, options) -> reward."""
     terminated: Compiled
-    """(state) -> True if the episode ends in that state."""
+    """Function (state) -> True if the episode terminates in that state."""
 
 
 def compiled_outcomes(task: Task) -> Outcomes:
-    """Return the compiled functions of a task; built-in ones compile on first use."""
+    """Return the compiled functions of a task; functions of built-in tasks compile on first use."""
     size, has_several_motors = len(task.state_names), len(task.motors) > 1
     functions = task.observation, task.reward, task.terminated
     return _compiled(*functions, task.options, size, task.observation_names, has_several_motors)  # type: ignore[arg-type]

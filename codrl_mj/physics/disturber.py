@@ -35,9 +35,9 @@ class DisturberParameters(NamedTuple):
     """Remaining fraction of an integration step."""
     quantum: float
     """Quantization step of commands [N or N*m]."""
-    limit: float
+    max_command: float
     """Largest command [N or N*m]."""
-    change: float
+    max_change: float
     """Largest change of the command in an integration step [N or N*m]."""
     pulse_force: float
     """Size of load pulses [N or N*m]."""
@@ -52,6 +52,7 @@ class DisturberParameters(NamedTuple):
 
 
 _AFTER_HISTORY = 1 + len(PULSE_NAMES)
+"""Number of entries in a row of the memory after the delayed commands."""
 
 
 class Disturber:
@@ -70,11 +71,11 @@ class Disturber:
         simulations: int,
         force_per_position: np.ndarray | None = None,
     ) -> None:
-        """Start with an empty memory, for a number of simulations at a timestep [s].
+        """Create the memory of a number of simulations at a timestep [s].
 
         `limits`, shape (n,), are the largest forces [N or N*m] of the actuators of one simulation,
         and `force_per_position` is as in `DisturberParameters`. Without disturbances, commands
-        arrive unchanged, there are no loads, and rows are empty.
+        arrive unchanged, there are no loads, and the rows have no entries.
         """
         self.enabled = disturbances != NO_DISTURBANCES
         whole_steps, fraction = whole_and_fraction(disturbances.command_delay, timestep)
@@ -101,16 +102,18 @@ class Disturber:
         length = whole_steps + 1 + (fraction > 0.0) + _AFTER_HISTORY if self.enabled else 0
         self.memory = np.zeros((simulations * len(rows), length))
 
-    def reset(self, rows: np.ndarray, keys: Any, held: Any = 0.0) -> None:
-        """Clear the memory at the start of episodes of m simulations with these random keys.
+    def reset(self, rows: np.ndarray, keys: Any, initial_commands: Any = 0.0) -> None:
+        """Start episodes of the m simulations `rows`, with random keys (m,).
 
-        Until the first command arrives, the commands are `held` (m, n) [N or N*m].
+        Until the first delayed command arrives, `initial_commands` (m, n) [N or N*m] apply.
         """
         count = len(self.parameters)
-        held = np.broadcast_to(held, (len(rows), count))
+        initial_commands = np.broadcast_to(initial_commands, (len(rows), count))
         for actuator in range(count if self.enabled else 0):
             self.memory[rows * count + actuator] = 0.0
-            self.memory[rows * count + actuator, :KEY_COLUMN] = held[:, actuator, np.newaxis]
+            self.memory[rows * count + actuator, :KEY_COLUMN] = initial_commands[
+                :, actuator, np.newaxis
+            ]
             self.memory[rows * count + actuator, KEY_COLUMN] = np.asarray(keys) + actuator
 
     def disturb_commands(self, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -137,7 +140,7 @@ _pulses = internal(pulse_load)
 def disturb(
     parameters: DisturberParameters, memory: np.ndarray, force: float
 ) -> tuple[float, float]:
-    """Return an actuator's next command and its mean load over the step; `memory` is its row."""
+    """Return an actuator's next command and mean load in a step, and update its row `memory`."""
     length = len(memory) - _AFTER_HISTORY
     for entry in range(length - 1, 0, -1):
         memory[entry] = memory[entry - 1]
@@ -146,9 +149,9 @@ def disturb(
         memory[int(parameters.delay_steps)], memory[length - 1], parameters.delay_fraction
     )
     if parameters.quantum != 0.0:
-        arrived = quantize(arrived, parameters.quantum, parameters.limit)
-    if parameters.change != 0.0:
-        arrived = limit_rate(arrived, memory[length], parameters.change)
+        arrived = quantize(arrived, parameters.quantum, parameters.max_command)
+    if parameters.max_change != 0.0:
+        arrived = limit_rate(arrived, memory[length], parameters.max_change)
         memory[length] = arrived
     if parameters.pulse_force == 0.0:
         return arrived, 0.0

@@ -15,7 +15,7 @@ from codrl_mj.user_code import asset_path
 def configure_actuator(
     target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float | None
 ) -> None:
-    """Configure an actuator of an `MjSpec` for the callback backend; an ideal one is a `<motor>`.
+    """Configure an actuator of an `MjSpec` for the callback backend; if ideal, as a `<motor>`.
 
     Its gear, control, dynamics, gain and bias are overwritten. `max_force` limits the desired force
     [N] or torque [N*m] at the joint.
@@ -33,10 +33,10 @@ def configure_actuator(
 
 
 def hills(model: mujoco.MjModel) -> list[int]:
-    """Return the joints of a model that run over one of our hills (see `codrl_mj.engine.hill`).
+    """Return the slide joints of a model that follow a hill, see `codrl_mj.engine.hill`.
 
     Raises:
-        ValueError: a joint carries our signature but not our layout.
+        ValueError: a joint's user data has this package's signature, but is no valid hill.
     """
     joints = []
     for index in range(model.njnt):
@@ -62,7 +62,8 @@ def needed_callbacks(model: mujoco.MjModel) -> tuple[str, ...]:
     """Return the groups of callbacks, as in `codrl_mj.engine.install`, that a model needs.
 
     Raises:
-        ValueError: the user data of an actuator or joint has our signature, but not our layout.
+        ValueError: the user data of an actuator or joint has this package's signature, but not its
+            layout.
     """
     # Actuators of the plugin backend need no callback.
     callback_motors = [index for index in motors(model) if model.actuator_plugin[index] < 0]
@@ -74,13 +75,14 @@ def needed_callbacks(model: mujoco.MjModel) -> tuple[str, ...]:
 def install_callbacks(model: mujoco.MjModel) -> None:
     """Compile the families of a model's actuators, and install the callbacks that it needs.
 
-    A model without such actuators needs none.
+    A model without actuators or hills of this package needs none.
 
     Args:
         model: any MuJoCo model.
 
     Raises:
-        ValueError: the user data of an actuator or joint has our signature, but not our layout.
+        ValueError: the user data of an actuator or joint has this package's signature, but not its
+            layout.
         CallbackInUseError: another library installed a callback; nothing was changed.
     """
     for actuator in motors(model).values():
@@ -101,11 +103,13 @@ def task_model(simulation: SimulationConfig) -> mujoco.MjModel:
         spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
     except ValueError as error:
         raise ValueError(f"{task.asset}: {' '.join(str(error).split())}") from error
-    if others := [name for name in task.integrators if INTEGRATORS[name] != spec.option.integrator]:
+    if unsupported := [
+        name for name in task.integrators if INTEGRATORS[name] != spec.option.integrator
+    ]:
         kind = mujoco.mjtIntegrator(spec.option.integrator).name.removeprefix("mjINT_")
         raise ValueError(
             f"{task.asset}: its <option> has integrator {kind}, so Task.integrators cannot have"
-            f" {', '.join(others)}"
+            f" {', '.join(unsupported)}"
         )
     spec.option.timestep = simulation.timestep
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -145,7 +149,7 @@ def task_model(simulation: SimulationConfig) -> mujoco.MjModel:
     model = spec.compile()
     if (model.nq, model.nv) != (len(task.qpos), len(task.qvel)):
         raise ValueError(
-            f"{task.asset} has {model.nq} positions and {model.nv} velocities, and {task.name}'s"
+            f"{task.asset} has {model.nq} positions and {model.nv} velocities, but {task.name}'s"
             f" state_names have {len(task.qpos)} and {len(task.qvel)} of them:"
             f" {', '.join(task.state_names)}"
         )
@@ -167,8 +171,8 @@ def _check_direct_drive(
     }
     for element in (element for element, is_set in elements.items() if is_set):
         raise ValueError(
-            f"{asset}: actuator {motor.name!r}: leave out {element}; gear and limits are the"
-            " actuator's, such as gear_ratio, arm_radius and max_current, and Task.max_force"
+            f"{asset}: actuator {motor.name!r}: leave out {element}; set gears and limits in the"
+            " actuator (gear_ratio, arm_radius, max_current) and in Task.max_force"
         )
 
 

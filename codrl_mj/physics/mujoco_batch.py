@@ -32,9 +32,10 @@ DERIVED = (
 
 
 class MujocoBatchPhysics:
-    """N simulations of one task, identical to N `MujocoPhysics` in every bit, as arrays.
+    """N simulations of one task as arrays, bit for bit identical to N `MujocoPhysics`.
 
-    Every simulation has its own actuators: parameters are model fields with a value per simulation.
+    Every simulation has its own actuators, because their parameters are model fields with a value
+    for each simulation.
     """
 
     def __init__(
@@ -43,9 +44,9 @@ class MujocoBatchPhysics:
         actuators: Sequence[Sequence[ActuatorModel]],
         num_threads: int = 0,
     ) -> None:
-        """Compile the model and make the rows, one for each of N tuples of `actuators`.
+        """Compile the model and create a row for each of the N tuples in `actuators`.
 
-        All actuators must be of the family of `simulation`; `num_threads` = 0 uses all CPUs.
+        All actuators must be of the family in `simulation`. `num_threads` = 0 uses all CPUs.
         """
         self.simulation, task = simulation, simulation.task
         self.num_envs, self._num_threads = len(actuators), num_threads
@@ -131,7 +132,8 @@ class MujocoBatchPhysics:
     ) -> None:
         """Set parameters (m, n, p) and arms [m] (m, n) of m simulations; then reset them.
 
-        Quantities that they add to their joints belong to the models: see `set_model`.
+        The inertia and friction that they add to their joints are fields of the models, which this
+        does not change: see `set_model`.
         """
         if not self.simulation.motors_added:
             return
@@ -150,7 +152,7 @@ class MujocoBatchPhysics:
         self._arms[rows] = arms
 
     def set_model(self, rows: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
-        """Change model fields, as from `Variation.fields`, of simulations; then reset them."""
+        """Change model fields, named as in `Variation.fields`; then reset these simulations."""
         for name, values in fields.items():
             self.field(name)[rows] = values
         if "dof_frictionloss" in fields:
@@ -180,7 +182,7 @@ class MujocoBatchPhysics:
         self._qpos[:], self._qvel[:] = states[:, self._positions], states[:, self._velocities]
 
     def models(self) -> Iterator[mujoco.MjModel]:
-        """Yield one model with each simulation's fields in turn, except for visual fields."""
+        """Yield one model object, with the non-visual fields of each simulation in turn."""
         model = copy.copy(self.model)
         for row in range(self.num_envs):
             write_fields(model, self._fields, row)
@@ -201,7 +203,7 @@ class MujocoBatchPhysics:
     def step(self, kernel: Any, steps: Any) -> bool:
         """Take an environment step of every simulation; return True if any diverged.
 
-        `kernel` is `Kernels.step_rows` of `codrl_mj.envs.compiled`.
+        `kernel` is `Kernels.step_rows`, and `steps` a `VectorStep`, of `codrl_mj.envs.compiled`.
         """
         self._lane()
         # Helping threads keep the arguments of the turn in which they joined, so new arguments need
@@ -214,7 +216,7 @@ class MujocoBatchPhysics:
         )
 
     def observe(self, kernel: Any, rows: np.ndarray, observations: np.ndarray) -> None:
-        """Observe simulations whose episodes start; `kernel` is `Kernels.observe_rows`."""
+        """Fill observations of simulations that were reset; `kernel` is `Kernels.observe_rows`."""
         kernel(rows, self._lane(), self._rows, observations)
 
     @property
@@ -223,7 +225,7 @@ class MujocoBatchPhysics:
         return self._disturber.memory.reshape(self.num_envs, -1)
 
     def check_finite(self, states: np.ndarray, rows: np.ndarray) -> None:
-        """Raise if a state is not finite where the mask `rows` (N,) is True; name the first."""
+        """Raise if a state is invalid where `rows` (N,) is True; the message names the first."""
         is_valid = np.abs(states) <= MAX_STATE
         diverged = np.flatnonzero(~is_valid.all(axis=1) & rows)
         if len(diverged) == 0:

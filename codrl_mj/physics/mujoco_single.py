@@ -14,16 +14,16 @@ from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_mo
 from codrl_mj.physics.stepping import Wiring, compiled_stepping, make_pointer_table
 from codrl_mj.physics.variation import write_fields
 
-ARM = Wiring._fields.index("arm")
+ARM_COLUMN = Wiring._fields.index("arm")
 
 
 class MujocoPhysics(Physics):
-    """MJCF model and data of a task.
+    """Simulation of a task with its MJCF model.
 
-    One `mj_step` is one integration step. With CartPole's explicit Euler integrator the positions
-    then change by the old velocity instead of the new one. For slide and hinge joints this is
-    exactly Gymnasium's update. If the task has bounds (`Task.constrain`), the state is moved back
-    inside them after every integration step.
+    One `mj_step` is one integration step. With CartPole's explicit Euler integrator, the positions
+    are then recomputed with the old velocities instead of the new ones. For slide and hinge joints
+    this is exactly Gymnasium's update. If the task has bounds (`Task.constrain`), the state is
+    moved back inside them after every integration step.
     """
 
     def __init__(self, simulation: SimulationConfig) -> None:
@@ -74,7 +74,7 @@ class MujocoPhysics(Physics):
             engine.install(*self._callbacks)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return everything but the views and the model, which a copy takes from its data."""
+        """Return all attributes except views and model; a copy takes the model from its data."""
         return {name: value for name, value in self.__dict__.items() if name not in _VIEWS}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -111,7 +111,8 @@ class MujocoPhysics(Physics):
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Replace the actuators by others of their family; a reset must follow.
 
-        Quantities that they add to their joints belong to the model: see `set_model`.
+        The inertia and friction that they add to their joints are fields of the model, which this
+        does not change: see `set_model`.
         """
         if not self.simulation.motors_added:
             return
@@ -127,7 +128,7 @@ class MujocoPhysics(Physics):
             self.model.actuator_user[index, USER_HEADER_SIZE:parameters_end] = parameter_values
             self.model.actuator_gear[self.model.actuator_outadr[index], 0] = 1.0 / arm
             self.model.actuator_ctrlrange[int(self.wiring[row].ctrl)] = -limit * arm, limit * arm
-            self.settings[row, ARM] = arm
+            self.settings[row, ARM_COLUMN] = arm
 
     def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
         """Change fields of the model, named as in `Variation.fields`, before a reset."""
@@ -160,9 +161,9 @@ class MujocoPhysics(Physics):
         return readings
 
     def snapshot(self) -> np.ndarray:
-        """Return simulation and motor as a vector (`mjSTATE_INTEGRATION`), float64.
+        """Return the state of simulation and motors (`mjSTATE_INTEGRATION`) as a vector, float64.
 
-        It does not include `memory` and changes by `set_actuators` and `set_model`.
+        It includes neither `memory` nor changes by `set_actuators` and `set_model`.
         """
         vector = np.empty(mujoco.mj_stateSize(self.model, _STATE))
         mujoco.mj_getState(self.model, self.data, vector, _STATE)
@@ -174,7 +175,7 @@ class MujocoPhysics(Physics):
 
 
 def _to_slice(entries: tuple[int, ...]) -> slice:
-    """Return an arithmetic progression as a slice, with which numpy is faster than with a list."""
+    """Return evenly spaced indices as a slice, which numpy handles faster than a list."""
     stride = entries[1] - entries[0] if len(entries) > 1 else 1
     return slice(entries[0], entries[-1] + 1, stride)
 

@@ -1,4 +1,4 @@
-"""Rendering of a MuJoCo model off screen, with errors that name a remedy, and in a window."""
+"""Off-screen rendering of MuJoCo models, and a window that shows the images."""
 
 import atexit
 import functools
@@ -19,22 +19,22 @@ class RenderingUnavailableError(RuntimeError):
     """No OpenGL context can be created on this machine or in this process."""
 
 
-_open: "weakref.WeakSet[OffscreenRenderer]" = weakref.WeakSet()
-# The error after which this process cannot use OpenGL: another attempt would end the process.
-_fatal: list[mujoco.FatalError] = []
+_open_renderers: "weakref.WeakSet[OffscreenRenderer]" = weakref.WeakSet()
+# After this error the process cannot use OpenGL: another attempt would end the process.
+_fatal_errors: list[mujoco.FatalError] = []
 
 
 @functools.cache
-def _watch_process() -> None:
-    """Free open contexts at exit, before the OpenGL library shuts down.
+def _register_cleanup() -> None:
+    """Free open contexts at exit, before the OpenGL library shuts down, and abandon them in forks.
 
-    Call it after the first context was created, because that registers the library's own shutdown,
-    and functions registered later run earlier. A forked process creates new contexts.
+    Call this after creating the first context: that registers the library's own shutdown, and
+    functions that are registered later run earlier.
     """
 
     @atexit.register
     def close_all() -> None:
-        for renderer in list(_open):
+        for renderer in list(_open_renderers):
             renderer.close()
 
     # Windows has no fork.
@@ -43,17 +43,16 @@ def _watch_process() -> None:
 
 
 def _abandon_after_fork() -> None:
-    """Abandon contexts and display after a fork, where waiting for the lost threads would hang.
+    """Abandon contexts and display in a forked process, where using them could hang.
 
-    A software renderer's threads stay in the parent process. A display of another EGL platform
-    starts new threads; if no other platform is available, the inherited display is used.
+    The threads of a software renderer exist only in the parent process. A display of another EGL
+    platform starts new threads; if there is no other platform, the inherited display is used.
     """
     egl: Any = sys.modules.get("mujoco.egl")
     if egl is None:
         return
     atexit.unregister(egl.EGL.eglTerminate)
-    # PyOpenGL raises its own errors, and only the EGL backend needs it.
-    for renderer in list(_open):
+    for renderer in list(_open_renderers):
         _abandon(renderer._renderer)
         renderer._renderer = None
     try:
@@ -61,6 +60,7 @@ def _abandon_after_fork() -> None:
             egl.EGL.eglGetPlatformDisplayEXT(_EGL_PLATFORM_SURFACELESS, None, None)
             or egl.EGL_DISPLAY
         )
+    # PyOpenGL's errors cannot be named here, because only the EGL backend imports it.
     except Exception:
         return
 
@@ -72,8 +72,8 @@ class OffscreenRenderer:
     """Renderer of a model into RGB arrays.
 
     By default shadows, reflections and multisampling are off: on a CPU renderer they cost ten times
-    as much as everything else. Most of the remaining time is spent on the sky, which is drawn once
-    for each pose of the camera.
+    as much as everything else. The sky would take most of the remaining time, so it is drawn only
+    once for each pose of the camera.
     """
 
     def __init__(
@@ -106,8 +106,8 @@ class OffscreenRenderer:
         self._sky: tuple[bytes, np.ndarray] = (b"", np.empty(0))
         self._reuses_sky = not pretty and _only_sky_is_black(model)
         self._renderer: mujoco.Renderer | None = self._make()
-        _open.add(self)
-        _watch_process()
+        _open_renderers.add(self)
+        _register_cleanup()
 
     def _make(self) -> mujoco.Renderer:
         """Create the renderer; its frame buffer is no larger than the image, to save clearing."""
@@ -120,16 +120,16 @@ class OffscreenRenderer:
             if egl is not None and egl.EGL_DISPLAY:
                 egl.EGL.eglInitialize(egl.EGL_DISPLAY, None, None)
             limits.offwidth, limits.offheight = self._size
-            if _fatal:
-                raise _fatal[0]
+            if _fatal_errors:
+                raise _fatal_errors[0]
             return mujoco.Renderer(self._model, height=height, width=width)
         except Exception as error:
             if (
-                not _fatal
+                not _fatal_errors
                 and isinstance(error, mujoco.FatalError)
                 and "platform library" in str(error)
             ):
-                _fatal.append(error)
+                _fatal_errors.append(error)
             backend = os.environ.get("MUJOCO_GL", "not set")
             raise RenderingUnavailableError(
                 f"cannot make an OpenGL context (MUJOCO_GL is {backend}): {type(error).__name__}:"
@@ -163,8 +163,8 @@ class OffscreenRenderer:
         view = bytes(
             np.concatenate([np.append(camera.forward, camera.up) for camera in scene.camera])
         )
-        # The first image of a camera pose shows the sky alone. Later images take their black pixels
-        # from it.
+        # For a new camera pose, the sky is first rendered without the bodies. It then replaces the
+        # black pixels of all images in this pose.
         if view != self._sky[0]:
             scene.ngeom, count = 0, scene.ngeom
             self._sky = view, self._renderer.render()
@@ -180,9 +180,9 @@ class OffscreenRenderer:
         renderer, self._renderer = getattr(self, "_renderer", None), None
         if renderer is None:
             return
-        # Buffers are freed in their own context: in another context the same names belong to other
-        # buffers. If its display has ended, the context may still become current, but cannot be
-        # freed.
+        # Buffers are freed in their own context, because in another context the same names belong
+        # to other buffers. If the display has ended, the context can still become current, but
+        # freeing it raises.
         try:
             current = _make_current(renderer)
             if current:
@@ -227,7 +227,8 @@ def _abandon(renderer: mujoco.Renderer | None) -> None:
     """Abandon a renderer whose context no longer exists or belongs to another process."""
     egl: Any = sys.modules.get("mujoco.egl")
     if egl is not None and renderer is not None:
-        # Without a current context, freeing the renderer's buffers cannot free those of others.
+        # Without a current context, freeing the renderer's buffers cannot free those of another
+        # context.
         egl.EGL.eglReleaseThread()
         renderer._gl_context._context = None
         renderer.close()

@@ -14,7 +14,7 @@ import numpy as np
 from codrl_mj.compile_cache import njit
 from codrl_mj.engine.layout import addresses, engine_function, field_address
 from codrl_mj.engine.memory import copy_bytes, f64, internal
-from codrl_mj.physics.mujoco_single import ARM, MujocoPhysics
+from codrl_mj.physics.mujoco_single import ARM_COLUMN, MujocoPhysics
 from codrl_mj.physics.sharing import cache_aligned_copy
 from codrl_mj.physics.stepping import PointerTable
 
@@ -50,8 +50,8 @@ class Lane(NamedTuple):
     """Simulation of one thread, and the addresses to which the parts of a row are copied."""
 
     fields: np.ndarray
-    """For each model field in the rows: its address, the address of the first row's value, the
-    stride of rows [bytes] and the size of a value [bytes]; shape (f, 4).
+    """For each model field in the rows: its address in the lane's model, the address of its first
+    row, the stride between rows [bytes] and the size of a row [bytes]; shape (f, 4).
     """
     parts: np.ndarray
     """For each part of the state: its address in the data, its first entry in a row, its length;
@@ -60,8 +60,9 @@ class Lane(NamedTuple):
     pointer_table: np.ndarray
     """Pointers of the simulation, see `codrl_mj.physics.stepping`."""
     settings: np.ndarray
-    """Copy of the settings for this lane."""
+    """Copy of the actuators' settings for this lane."""
     trace: np.ndarray
+    """Trace of this lane's last environment step."""
 
 
 def state_slice(model: mujoco.MjModel, name: str) -> slice:
@@ -114,7 +115,7 @@ def load(rows: Rows, row: int, lane: Lane) -> None:
         for entry in range(lane.parts[part_index, 2]):
             live[entry] = stored[entry]
     for motor in range(len(lane.settings)):
-        lane.settings[motor, ARM] = rows.arms[row, motor]
+        lane.settings[motor, ARM_COLUMN] = rows.arms[row, motor]
 
 
 @internal

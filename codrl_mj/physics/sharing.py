@@ -1,8 +1,9 @@
 """Threads that share the rows of a batch, step after step.
 
-One thread leads: it begins a turn, takes part in it and ends it. The others help: they wait for
-turns in compiled code, where they do not need the interpreter, and sleep if no turn has started for
-a while. The threads communicate through a board of counters for each batch.
+In a turn, threads process all rows once. One thread leads: it begins a turn, takes part in it and
+ends it. The others help: they wait for turns in compiled code, where they do not need the
+interpreter, and sleep if no turn has started for a while. The threads communicate through a board
+of counters for each batch.
 """
 
 import atexit
@@ -22,7 +23,7 @@ from codrl_mj.engine.memory import atomic_add, atomic_load, internal
 from codrl_mj.physics.compiled_task import Compiled
 
 _MIN_STEPS_PER_THREAD = 64
-"""Minimum number of integration steps per thread that makes another thread worth waking."""
+"""Number of integration steps per thread below which waking another thread does not pay."""
 _ROUNDS_BEFORE_SLEEP, _POLLS_PER_ROUND = 1000, 500
 """Number of rounds in which a thread polls for the next turn before it sleeps, about a millisecond
 in total; and number of polls per round, after which it yields its CPU.
@@ -107,10 +108,10 @@ def _join_turn(board: np.ndarray, last: int) -> int:
 def make_shared_kernel(function: Compiled) -> Compiled:
     """Return a kernel (leads, board, rows, threads, lane, arguments) -> None that shares rows.
 
-    A leader runs one turn; a helper joins turns until none starts for a while. `function`
-    is a compiled function (first row, end row, lane, *arguments) -> number of simulations that
-    diverged. Threads claim rows until none are left, in smaller portions as fewer are left: no
-    thread waits long for another one, and a late thread delays no other.
+    A leader runs one turn; a helper joins turns until none starts for a while. `function` is a
+    compiled function (first row, end row, lane, *arguments) -> number of simulations that diverged.
+    Threads claim rows until none are left. Portions become smaller as fewer rows are left, so no
+    thread waits long for another, and a thread that starts late delays no other.
     """
 
     @internal
@@ -145,7 +146,7 @@ class _Worker:
 
     def __init__(self) -> None:
         self.board: np.ndarray | None = None
-        """Board of the batch that it helps with or was last asked to help with."""
+        """Board of the batch that this thread helps; None if it has stopped helping."""
         self.tasks: SimpleQueue[Any] = SimpleQueue()
         self.thread = threading.Thread(target=self._work, daemon=True)
         self.thread.start()
@@ -194,7 +195,7 @@ def run_shared(
         if helper_index == len(_WORKERS):
             _WORKERS.append(_Worker())
         worker = _WORKERS[helper_index]
-        # A worker stays with its batch, so of several batches that take turns it helps only one.
+        # A worker stays with its batch: if several batches step alternately, it helps only one.
         if worker.board is not board and worker.tasks.empty():
             worker.board = board
             worker.tasks.put((function, board, count, threads, lanes[helper_index + 1], arguments))

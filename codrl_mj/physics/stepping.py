@@ -61,7 +61,7 @@ NUM_WIRING = len(Wiring._fields)
 
 
 class PointerTable(NamedTuple):
-    """Addresses and sizes of a simulation, in an int64 array that must live as long as it."""
+    """Addresses and sizes of a simulation; stored in an int64 array that must exist as long."""
 
     model: int
     """Address, like the next six entries."""
@@ -83,9 +83,10 @@ class PointerTable(NamedTuple):
 def make_pointer_table(
     data: Any, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray
 ) -> np.ndarray:
-    """Return the `PointerTable` of a simulation; the contiguous arrays remain the caller's."""
+    """Return the `PointerTable` of a simulation; the caller keeps the contiguous arrays alive."""
     addresses_of_arrays = (array.ctypes.data for array in (settings, memory, trace))
     sizes = *settings.shape, memory.shape[-1], len(trace), trace.shape[-1]
+    # The environment fills in the two addresses of its options and its observation.
     return np.array([*addresses(data), *addresses_of_arrays, 0, 0, *sizes], np.int64)
 
 
@@ -123,18 +124,17 @@ class Stepping(NamedTuple):
     """Compiled functions; `pointers` is explained in the module's docstring."""
 
     step: Compiled
-    """(force, pointers) -> True if the state is valid, within `MAX_STATE`: takes one environment
-    step under a desired force [N or N*m], or an array (n,) of several. The actuators' signals are
-    in `trace`.
+    """Function (force, pointers) -> True if the new state is finite and within `MAX_STATE`.
+
+    It takes one environment step under a desired force [N or N*m], an array (n,) for several
+    actuators, and writes their signals to `trace`.
     """
     start: Compiled
-    """(state (n,), key, pointers) -> None, which starts an episode like `Physics.reset`."""
+    """Function (state (n,), key, pointers) -> None that starts an episode like `Physics.reset`."""
     read: Compiled
-    """(state (n,), pointers) -> None, which fills `state` with the present state."""
+    """Function (state (n,), pointers) -> None that fills `state` with the present state."""
     read_sensors: Compiled
-    """(row of trace (n, c), readings (n, k), pointers) -> None, which fills the sensors'
-    `readings`.
-    """
+    """Function (row of trace (n, c), readings (n, k), pointers) -> None that fills `readings`."""
 
 
 def compiled_stepping(simulation: SimulationConfig) -> Stepping:
@@ -160,8 +160,8 @@ def force_of(forces: Any, actuator: int) -> float:
     return forces[actuator] if isinstance(forces, np.ndarray) else forces
 
 
-# numba does not inline an overload. Inlining this function would drop stores through pointers as
-# dead code.
+# This is an overload because numba does not inline those: inlining would drop stores through
+# pointers as dead code.
 @overload(force_of)
 def _force_of(forces, actuator):  # type: ignore[no-untyped-def]  # noqa: ARG001 - numba compares the arguments' names
     if isinstance(forces, types.Array):
@@ -204,6 +204,8 @@ def _stepping(
                     )
                 ctrl[int(wiring.ctrl)] = command * wiring.arm
                 trace[inner, actuator, 0] = command
+            # Explicit Euler moves positions by the old velocities, but `mj_step` by the new ones.
+            # So the positions are computed before it and written after it.
             if explicit:
                 for entry in range(num_positions):
                     state[entry] = qpos[entry] + timestep * qvel[entry]

@@ -11,8 +11,8 @@ from numba import types
 from codrl_mj.compile_cache import external_function, njit
 
 WORDS = 6
-"""Length of a generator's state: state and increment of PCG64 (two words each), and its spare 32
-bits.
+"""Length of a generator's state: state and increment of PCG64 (two words each), and the flag and
+value of its spare 32 bits.
 """
 _LOW = 2**64 - 1
 _next_double = external_function(
@@ -89,7 +89,7 @@ def generator_words(generator: np.random.Generator) -> np.ndarray:
     pcg: Any = generator.bit_generator.state
     if pcg["bit_generator"] != "PCG64":
         raise ValueError(
-            f"np_random is a {pcg['bit_generator']}: must be a PCG64, as Gymnasium's reset makes it"
+            f"np_random is a {pcg['bit_generator']}: must be a PCG64, as Gymnasium's reset creates"
         )
     state, increment = pcg["state"]["state"], pcg["state"]["inc"]
     words = [

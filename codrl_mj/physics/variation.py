@@ -41,10 +41,10 @@ class JointAddress(NamedTuple):
 
 
 def joint_addresses(model: mujoco.MjModel, index: int) -> tuple[JointAddress | None, ...]:
-    """Return the addresses of an actuator's `JointAdditions`; None where the model has none.
+    """Return the addresses of an actuator's `JointAdditions`; None for one that the model lacks.
 
-    The additions of a motor in the control callback are those of its joint. A plugin's actuator has
-    its own gear, inertia and damping.
+    In the callback backend, all three are fields of the joint. In the plugin backend, inertia and
+    damping are fields of the actuator, which has its own gear.
     """
     kind, target = mujoco.mjtTrn(model.actuator_trntype[index]), int(model.actuator_trnid[index, 0])
     friction_address: JointAddress | None = None
@@ -68,13 +68,13 @@ def joint_addresses(model: mujoco.MjModel, index: int) -> tuple[JointAddress | N
 
 @functools.cache
 def bare_model(task: str, joint: Joint = UNMODIFIED_JOINT) -> mujoco.MjModel:
-    """Return the model of a task without actuators' additions; it must not be changed."""
+    """Return the cached model of a task without its actuators' additions; do not change it."""
     return task_model(
         SimulationConfig(TASKS[task], (IDEAL,) * len(TASKS[task].motors), joint=joint)
     )
 
 
-def without_motors(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> mujoco.MjModel:
+def without_additions(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> mujoco.MjModel:
     """Return a copy of a model without the additions of its motors, keyed by actuator index."""
     bare = copy.copy(model)
     for index, motor in motors.items():

@@ -1,4 +1,4 @@
-"""Tasks: the only definition of their observations, rewards, terminations and resets."""
+"""Tasks: one definition of observations, rewards, terminations and resets for all physics."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -29,7 +29,8 @@ def resolve_actuators(actuator: Any, task: Task) -> tuple[Any, ...]:
 
     Args:
         actuator: an argument of `codrl_mj.actuators.resolve`, or the name `default` for the task's
-            default actuator. A list has an entry for each motor; anything else holds for all.
+            default actuator. A list has an entry for each motor; anything else applies to all
+            motors.
         task: the task; names such as `weak` are variations of its paper actuators.
 
     Raises:
@@ -39,7 +40,9 @@ def resolve_actuators(actuator: Any, task: Task) -> tuple[Any, ...]:
     count = len(task.motors)
     requests = list(actuator) if isinstance(actuator, list | tuple) else [actuator] * count
     if len(requests) != count:
-        hint = "; a list with one for each environment is for codrl_mj.make_vec" * (count == 1)
+        hint = "; codrl_mj.make_vec takes a list with an actuator for each environment" * (
+            count == 1
+        )
         motors = f"{task.name} has {count} motor{'s' * (count > 1)} ({', '.join(task.motors)})"
         raise ValueError(f"actuator: got {len(requests)} actuators, but {motors}{hint}")
     # `default` depends on the task, which `resolve` does not know.

@@ -17,8 +17,8 @@ dynamics, without its torque noise.
 | 4 | `velocity_1` | -4 pi | 4 pi | rad/s |
 | 5 | `velocity_2` | -9 pi | 9 pi | rad/s |
 
-Angle 1 is the first link's, 0 hanging down; angle 2 the second's relative to the first. Both grow
-counter-clockwise and are wrapped to [-pi, pi].
+Angle 1 is that of the first link, 0 when it hangs down; angle 2 is that of the second link relative
+to the first. Both grow counter-clockwise and are wrapped to [-pi, pi].
 
 ## Action space
 
@@ -40,8 +40,8 @@ The tip is more than 1 m above the shoulder, which is success: -cos(angle 1) - c
 
 ## Arguments
 
-[The arguments of every environment](arguments.md). RK4 is Gymnasium's, ten steps with a motor the
-paper's choice.
+[The arguments of every environment](arguments.md). The integrator is RK4, as in Gymnasium. With a
+motor an environment step has ten integration steps, as in the paper.
 """
 
 import math
@@ -130,18 +130,18 @@ class ReferenceEnv(GymnasiumReferenceEnv):
         """Take a `step` with the torque as the only one available."""
         # The environment has only one integrator.
         del integrator
-        # Gymnasium wraps angles turn by turn: after a huge step its loop would not end.
+        # Gymnasium wraps angles by one turn at a time; after a huge step that loop would not end.
         if not abs(force) * timestep**2 < self._MAX_IMPULSE:
             return np.full(4, np.nan)
-        return self.after(state, 0, AVAIL_TORQUE=[force], dt=timestep)
+        return self.state_after(state, 0, AVAIL_TORQUE=[force], dt=timestep)
 
     def derivative(self, state: np.ndarray, force: float) -> np.ndarray:
         """Return the state's time derivative by the environment's equations of motion."""
         return np.array(self.env._dsdt([*state, force]))[: len(state)]
 
 
-_LINK = ("body_mass",)
-_CENTER = ("body_ipos",)
+_MASS_ONLY = ("body_mass",)
+_CENTER_ONLY = ("body_ipos",)
 
 
 TASK = Task(
@@ -186,11 +186,11 @@ TASK = Task(
             varies=("model.length.upper",),
             only=("body_pos", "geom_pos", "geom_size"),
         ),
-        "LINK_LENGTH_2": Fixed(1.0, "nothing but the picture depends on it, in Gymnasium too"),
-        "LINK_MASS_1": mass("upper", only=_LINK),
-        "LINK_MASS_2": mass("lower", only=_LINK),
-        "LINK_COM_POS_1": center_of_mass("upper", -1.0, only=_CENTER),
-        "LINK_COM_POS_2": center_of_mass("lower", -1.0, only=_CENTER),
+        "LINK_LENGTH_2": Fixed(1.0, "only the picture depends on it, in Gymnasium too"),
+        "LINK_MASS_1": mass("upper", only=_MASS_ONLY),
+        "LINK_MASS_2": mass("lower", only=_MASS_ONLY),
+        "LINK_COM_POS_1": center_of_mass("upper", -1.0, only=_CENTER_ONLY),
+        "LINK_COM_POS_2": center_of_mass("lower", -1.0, only=_CENTER_ONLY),
         "LINK_MOI": ModelNumber(
             *("body_inertia", "upper", 1),
             varies=("model.mass.upper", "model.mass.lower"),
@@ -200,13 +200,13 @@ TASK = Task(
         "MAX_VEL_2": Fixed(MAX_SPEED_2),
         "AVAIL_TORQUE": Setting.FORCES,
         "torque_noise_max": Fixed(0.0, "make an environment with disturbances"),
-        "book_or_nips": Fixed("book", "the MuJoCo model has no such thing"),
+        "book_or_nips": Fixed("book", "the MuJoCo model has only the dynamics of the book"),
     },
     reference_states=ReferenceStates(
-        # Speeds are half the task's limits, at which an RK4 step of Gymnasium amplifies rounding to
-        # 1e-12.
+        # Speeds are about half the task's limits: at the limits, an RK4 step of Gymnasium amplifies
+        # rounding errors to 1e-12.
         bounds=(np.pi, np.pi, 2 * np.pi, 4 * np.pi),
-        # On the cut of the angles, and faster than the first link may turn after the step.
+        # Angles at the wrap, and speeds with which the first link exceeds its limit after the step.
         edges=(
             (*values_around(math.pi), 0.0),
             (*values_around(math.pi), 0.0),

@@ -1,11 +1,11 @@
-"""Sources of the numbers that environments have as attributes: `env.unwrapped.gravity`."""
+"""Sources of numeric attributes of environments, such as `env.unwrapped.gravity`."""
 
 import enum
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 COMPILED = (
-    "it is compiled into the task's functions: limit or end episodes in a `gymnasium.Wrapper`"
+    "it is compiled into the task's functions: use a `gymnasium.Wrapper` for other limits or ends"
 )
 
 
@@ -21,7 +21,7 @@ class ModelNumber(NamedTuple):
     scale: float = 1.0
     """Ratio of the attribute to the model's number."""
     inverse: bool = False
-    """True if the attribute is the inverse of the number."""
+    """True if the attribute is the reciprocal of the number."""
     varies: tuple[str, ...] = ()
     """Quantities that scale with the number, by their names in `randomize`; it must then be > 0."""
     only: tuple[str, ...] = ()
@@ -42,7 +42,7 @@ class Derived(NamedTuple):
 
     names: tuple[str, ...]
     """Names of the other attributes."""
-    of: Callable[..., float]
+    function: Callable[..., float]
     """Function (their values) -> the number."""
 
 
@@ -61,15 +61,15 @@ GRAVITY = ModelNumber("opt.gravity", entry=2, scale=-1.0)
 
 
 def mass(body: str, only: tuple[str, ...] = (), inverse: bool = False) -> ModelNumber:
-    """Return the attribute of a body's mass [kg], with which its inertia scales."""
+    """Return the attribute for a body's mass [kg]; a written mass also scales its inertia."""
     return ModelNumber(
         "body_mass", body, inverse=inverse, varies=(f"model.mass.{body}",), only=only
     )
 
 
 def center_of_mass(body: str, scale: float = 1.0, only: tuple[str, ...] = ()) -> ModelNumber:
-    """Return the attribute of the distance of a body's center of mass from its joint [m].
+    """Return the attribute for the distance [m] of a body's center of mass from its joint.
 
-    All lengths along the body scale with it.
+    A written distance scales all lengths along the body.
     """
     return ModelNumber("body_ipos", body, 2, scale, varies=(f"model.length.{body}",), only=only)

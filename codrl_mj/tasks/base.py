@@ -53,7 +53,7 @@ class Task(fields.Checked):
 
     Raises:
         ValueError: a field is out of bounds, or a function, called once on plain numbers, returns
-            something else than other fields declare.
+            something other than the fields declare.
     """
 
     name: str
@@ -83,7 +83,7 @@ class Task(fields.Checked):
     initial_bounds: Callable[[dict[str, Any] | None], tuple[np.ndarray, np.ndarray]]
     """Function (reset options) -> lower and upper bounds of the k numbers drawn at a reset.
 
-    Each has shape (k,). The numbers are those that Gymnasium draws.
+    Each has shape (k,). Tasks of Gymnasium draw the same numbers as Gymnasium.
     """
     initial_state: Callable[[Entries], tuple[Any, ...]]
     """Function (k numbers drawn uniformly within the bounds) -> entries of the initial state."""
@@ -97,7 +97,7 @@ class Task(fields.Checked):
     """Function (integrated state, integration step [s]) -> entries of the state within its bounds.
 
     The bounds are those of Gymnasium's `step`: speed limits, walls, wrapped angles. They are
-    applied after every integration step. The function must pass NaN on. None if there are no
+    applied after every integration step. The function must propagate NaN. None if there are no
     bounds.
     """
     goal: Callable[[Entries], Any] | None = None
@@ -107,7 +107,7 @@ class Task(fields.Checked):
     is to survive: an episode then succeeds if it is not terminated before the time limit.
     """
     goal_hold: float = fields.real(0.0, minimum=0.0, unit="s")
-    """Time at the goal [s], up to its end, that an episode needs for success."""
+    """Time [s] at the goal, up to the end of the episode, that success requires."""
 
     forces: tuple[Any, ...] | None = None
     """Desired forces [N] or torques [N*m] of the discrete actions, in order; None if the action is
@@ -117,7 +117,7 @@ class Task(fields.Checked):
     """Class of the task's options: a `NamedTuple` whose fields all have defaults."""
     qpos: tuple[int, ...] = ()
     """Indices of the state entries that are MuJoCo's `qpos`, in order; by default the state's first
-    half. They are evenly spaced, as are those of `qvel`.
+    half. They must be evenly spaced, as must those of `qvel`.
     """
     qvel: tuple[int, ...] = ()
     """Indices of the state entries that are MuJoCo's `qvel`; by default the second half."""
@@ -125,7 +125,7 @@ class Task(fields.Checked):
     """Action space, as in Gymnasium; by default forces up to `max_force` or indices of `forces`.
 
     A copy of the task with another `max_force` keeps the space, as Gymnasium's Pendulum does when
-    `max_torque` is written; a copy with None gets a new one.
+    `max_torque` is written; a copy with `action_space=None` gets a new space.
     """
     observation_space: spaces.Box = None  # type: ignore[assignment]
     """Observation space, as in Gymnasium; by default without bounds."""
@@ -144,9 +144,10 @@ class Task(fields.Checked):
     states, rewards and terminations; None if there is none.
     """
     reference_env: Callable[[], ReferenceEnv] | None = None
-    """Function that creates the reference: that environment, or equations of motion in closed form.
+    """Function that creates an independent reference for the task's dynamics.
 
-    It can be driven by any force. The analytic physics and the certificate use it.
+    The reference is the Gymnasium environment, or equations of motion in closed form, and accepts
+    any force. The analytic physics and the certificate use it.
     """
     ideal_inner_steps: int = fields.integer(1, minimum=1)
     """Integration steps per environment step when the actuator is ideal, as in Gymnasium."""
@@ -165,9 +166,9 @@ class Task(fields.Checked):
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     """Numbers that the task's environments have as attributes, by name, with their sources."""
     reference_states: ReferenceStates | None = None
-    """States in which the certificate tries the task.
+    """States in which the certificate compares the task with its reference.
 
-    Without them, it omits the checks that need states.
+    If it is None, the certificate omits the checks that need states.
     """
 
     def __post_init__(self) -> None:
@@ -217,7 +218,8 @@ class Task(fields.Checked):
     ) -> int:
         """Return the number of integration steps in an environment step.
 
-        It is given as `inner_steps`, by the integration step [s], or by default for an actuator.
+        The number is `inner_steps`, or follows from the integration step `timestep` [s]. If both
+        are None, it is the task's default for the actuator.
 
         Raises:
             ValueError: both are given, the number is below 1, or the timestep does not divide the
@@ -253,7 +255,7 @@ class Task(fields.Checked):
         return int(inner_steps)
 
     def integrator(self, name: str | None) -> str:
-        """Return an integrator's name; Gymnasium's integrator if None.
+        """Return the name of an integrator that the task has; None selects Gymnasium's.
 
         Raises:
             ValueError: the task has no such integrator.
@@ -276,10 +278,10 @@ class Task(fields.Checked):
     def observation_units(self) -> tuple[str | None, ...]:
         """Units of the observation's entries.
 
-        An entry that equals a state entry has its unit, and one within +-1 the unit 1; otherwise
-        the unit is unknown, None.
+        An entry that equals a state entry has the unit of that entry. Other entries have the unit 1
+        if their bounds are +-1, and otherwise None, unknown.
         """
-        # An entry that equals a state entry for several random states is that state entry.
+        # An entry that equals a state entry in several random states is taken to be a copy of it.
         states = np.random.default_rng(0).uniform(0.1, 1.0, (len(self.state_names), 5))
         units: list[str | None] = []
         for entry, low, high in zip(
@@ -304,7 +306,7 @@ class Task(fields.Checked):
             ValueError: the task does not read an option of this name, or the bounds are not finite
                 or not in order.
         """
-        # Only the names that the task looks up tell which options it has.
+        # A task does not declare its reset options, so the names that it looks up are recorded.
         recorded = None if options is None else _RecordingOptions(options)
         low, high = self.initial_bounds(recorded)  # type: ignore[arg-type]
         if recorded is not None:
@@ -313,8 +315,8 @@ class Task(fields.Checked):
             )
             if not (np.isfinite([low, high]).all() and np.less_equal(low, high).all()):
                 raise ValueError(
-                    f"reset options = {options}: give bounds {low} to {high}, must be finite and in"
-                    " order"
+                    f"reset options = {options}: the bounds are {low} to {high}, must be finite and"
+                    " in order"
                 )
         return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
 

@@ -22,7 +22,8 @@ it on a hinge. There is no friction. The actuator pushes the cart.
 
 1 a step, the last one included. With `center_radius` a step that ends farther than that from the
 center earns 0, and the episode goes on. With `sutton_barto_reward` the step that ends the episode
-earns -1, and with `center_radius` so does one that ends farther out; all others earn 0.
+earns -1, and so does, with `center_radius`, a step that ends outside that radius; all others earn
+0.
 
 ## Start
 
@@ -37,8 +38,8 @@ after 500 steps (10 s), which is success.
 ## Arguments
 
 [The arguments of every environment](arguments.md), and two more: `center_radius` [m], > 0, no limit
-by default, 0.1 in the paper's training; and Gymnasium's `sutton_barto_reward`. `euler` is explicit,
-Gymnasium's default.
+by default, 0.1 in the paper's training; and Gymnasium's `sutton_barto_reward`. The integrator
+`euler` is explicit and, as in Gymnasium, the default.
 """
 
 import math
@@ -91,9 +92,9 @@ def terminated(state: Entries) -> Any:
 
 
 def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
-    """Return 1, or 0 outside `center_radius`; with `sutton_barto_reward` 1 less.
+    """Return 1, or 0 outside `center_radius`.
 
-    The terminating step then has -1, too.
+    With `sutton_barto_reward`, return -1 for the terminating step and outside the radius, else 0.
     """
     outside = np.abs(next_state[0]) > options.center_radius
     if options.sutton_barto_reward:
@@ -119,7 +120,7 @@ class ReferenceEnv(GymnasiumReferenceEnv):
             "kinematics_integrator": integrator,
             "steps_beyond_terminated": None,
         }
-        return self.after(state, 1, force_mag=force, **settings)
+        return self.state_after(state, 1, force_mag=force, **settings)
 
 
 TASK = Task(
@@ -163,7 +164,7 @@ TASK = Task(
         "x_threshold": Fixed(X_LIMIT),
     },
     reference_states=ReferenceStates(
-        # More than an episode can reach: all angles, and the speeds of a falling pole.
+        # Beyond what an episode can reach: all angles, and the speeds of a falling pole.
         bounds=(4.8, 10.0, np.pi, 10.0),
         edges=(
             (-4.8, -2.4, 0.0, 2.4, 4.8),

@@ -19,7 +19,7 @@ _NAMES = ("state_names", "observation_names", "motors", "integrators")
 def check_fields(task: Any) -> None:
     """Raise an error if a field has a wrong type or value."""
     for name in _TEXTS:
-        _require(task, name, isinstance(getattr(task, name), str | Path), "a text")
+        _require(task, name, isinstance(getattr(task, name), str | Path), "a string")
     for name in (*_NAMES, "qpos", "qvel", "wrapped", "paper", "forces"):
         _require(task, name, isinstance(getattr(task, name) or (), tuple), "a tuple")
     for name in _NAMES:
@@ -40,7 +40,12 @@ def check_fields(task: Any) -> None:
     _require(
         task, "options", is_valid, "a typing.NamedTuple of numbers and flags that have defaults"
     )
-    _require(task, "paper", len(task.paper) in (0, motors), f"empty, or of {motors}: `motors`")
+    _require(
+        task,
+        "paper",
+        len(task.paper) in (0, motors),
+        f"empty, or have {motors} entries, one for each of `motors`",
+    )
     is_valid = _are_numbers(task.max_force, (), (motors,)) and np.min(task.max_force) > 0.0
     _require(
         task, "max_force", is_valid, "a finite number > 0" + f", or {motors} of them" * (motors > 1)
@@ -49,7 +54,7 @@ def check_fields(task: Any) -> None:
         forces and _are_numbers(forces, (len(forces), motors)[: 1 + (motors > 1)])
     )
     is_valid = is_valid and (forces is None or (np.abs(forces) <= task.max_force).all())
-    requirement = "a tuple of finite numbers" + f", or of tuples of {motors}" * (motors > 1)
+    requirement = "a tuple of finite numbers" + f", grouped into tuples of {motors}" * (motors > 1)
     _require(task, "forces", is_valid, f"{requirement}, within max_force = {task.max_force}")
 
 
@@ -63,8 +68,8 @@ def check_layout(task: Any) -> None:
         part and len({*np.diff(part)}) < 2 and part[0] <= part[-1] for part in parts
     )
     requirement = (
-        f"with qvel = {task.qvel!r} each index of the {states} state_names once, both evenly spaced"
-        " and ascending"
+        f"indices that together with qvel = {task.qvel!r} are each index of the {states}"
+        " state_names once; both must be evenly spaced and ascending"
     )
     _require(task, "qpos", is_valid, requirement)
     _require(
@@ -82,14 +87,19 @@ def check_layout(task: Any) -> None:
         task,
         "reference_states",
         lengths in (None, {states}),
-        f"of {states} bounds, edges and numbers of start",
+        f"ReferenceStates with {states} entries in each of bounds, edges and start",
     )
     expected: Any = spaces.Box(-np.inf, np.inf, (len(task.observation_names),), np.float32)
     is_valid = isinstance(box, spaces.Box) and (box.shape, box.dtype) == (
         expected.shape,
         expected.dtype,
     )
-    _require(task, "observation_space", is_valid, f"such as {expected}, by observation_names")
+    _require(
+        task,
+        "observation_space",
+        is_valid,
+        f"such as {expected}, with an entry for each of observation_names",
+    )
     expected = (
         spaces.Box(-1.0, 1.0, (len(task.motors),))
         if task.forces is None
@@ -161,7 +171,7 @@ def _call_function(task: Any, name: str, names: str, *arguments: Any) -> Any:
         function, call(f"Task.{name}", function, *arguments), form, f"Task.{names or name}"
     )
     array = np.array(value, dtype=np.float64)
-    # Entries must be finite, but a start may have an infinite reward.
+    # Entries of states and observations must be finite; a reward may be infinite.
     if (~np.isfinite(array) if names else np.isnan(array)).any():
         raise ValueError(
             f"{source_location(function)}: returns {value} for a state where an episode may start:"
@@ -175,7 +185,7 @@ def _are_numbers(value: Any, *shapes: tuple[int, ...]) -> bool:
     try:
         array = np.asarray(value)
     except ValueError:
-        # Nested tuples of different lengths are no array.
+        # numpy makes no array of nested tuples with different lengths.
         return False
     return array.dtype.kind in "iuf" and array.shape in shapes and bool(np.isfinite(array).all())
 

@@ -18,13 +18,13 @@ actuators (`paper`, `weak` and so on) are refused; `ideal` is the bare arm, with
 | 4 | `arm_velocity` | -inf | inf | rad/s |
 | 5 | `rod_velocity` | -inf | inf | rad/s |
 
-Angles grow counter-clockwise, the arm's as seen from above, the rod's as seen from outside: 0
-upright, not wrapped.
+Angles grow counter-clockwise, the arm's as seen from above, the rod's as seen from outside. The
+rod's angle is 0 upright. Angles are not wrapped.
 
 ## Action space
 
 `Box(-0.084, 0.084, (1,), float32)`: the desired torque on the arm [N*m]; it saturates at +-0.084,
-which the motor makes of the drive's largest current, 2 A.
+the motor's torque at the drive's largest current, 2 A.
 
 ## Reward
 
@@ -33,7 +33,7 @@ angles after the step and the torque delivered. It is never negative, so ending 
 
 ## Start
 
-Hanging: arm angle, rod angle less pi, and both velocities uniform in [-0.05, 0.05] (rad, rad/s).
+Hanging: arm angle, rod angle minus pi, and both velocities uniform in [-0.05, 0.05] (rad, rad/s).
 `reset(options={"low": ..., "high": ...})` sets the bounds.
 
 ## End
@@ -50,8 +50,8 @@ form, for actuators without a rotor.
 
 ## What to expect
 
-On 10 V PPO's `default` settings balance from all of five seeds, by torque, current or voltage, and
-return 231 to 233 of 250:
+At a supply of 10 V, PPO with its `default` settings learns to balance with each of five seeds,
+whether it commands torque, current or voltage. The return is 231 to 233 of at most 250:
 
 ```console
 $ codrl-mj train furuta --env.action voltage --actuator.supply.voltage 10 --seed 0 --out runs/volts
@@ -59,7 +59,7 @@ $ codrl-mj train furuta --env.action voltage --actuator.supply.voltage 10 --seed
 
 Beware of a local optimum: whirling the rod returns 190 and more.
 
-Policies trained on the ideal arm lose on weaker supplies (V) and behind delays (ms). The mean
+Policies trained on the ideal arm lose with weaker supplies (V) and with delays (ms). The mean
 return over three seeds, the worst in brackets ([all rows](furuta_supplies.csv) of
 `scripts/furuta_table.py`):
 
@@ -71,15 +71,16 @@ return over three seeds, the worst in brackets ([all rows](furuta_supplies.csv) 
 | 5 V | 34 (1) | 200 (181) | 218 (218) | 56 (1) |
 | 4 ms | 200 (135) | 232 (232) | 224 (221) | 232 (232) |
 
-Train at 18 V: you lose nothing down to 7 V and behind 8 ms, and still swing up at 5 V.
+Train at 18 V: the policy loses nothing down to 7 V and with a delay of 8 ms, and still swings up at
+5 V.
 
 ## Where the numbers come from
 
 Masses and lengths are the manual's (Quanser, *QUBE-Servo 2 User Manual*). Arm and rod are uniform:
 the arm's inertia about the shaft is m l^2/3 (some simulators have m l^2/12). Joint damping, 5e-6
-and 1e-6 N m s/rad, is what quanser_robots and Pyrado identified; others have up to five hundred
-times that: add it by `joint=` to the arm. There is no stiction, and the encoder's cable does not
-pull.
+and 1e-6 N m s/rad, was identified by quanser_robots and Pyrado. Others identified up to five
+hundred times as much; set it with `joint=`, which acts on the arm. There is no stiction, and the
+encoder's cable does not pull.
 """
 
 import math
@@ -106,7 +107,7 @@ def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarr
 
 
 def initial_state(draws: Entries) -> tuple[Any, ...]:
-    """Return the draws as the state; the rod's angle is drawn from hanging."""
+    """Return the draws as the state; the rod's angle is drawn relative to hanging."""
     return draws[0], draws[1] + math.pi, draws[2], draws[3]
 
 
@@ -152,7 +153,7 @@ class ReferenceEnv:
 
     with the arm's length L and speed w, and the rod's mass m, length l, angle a and speed v.
     Cazzolato and Prime, *On the Dynamics of the Furuta Pendulum*, Journal of Control Science and
-    Engineering (2011), measure a from hanging.
+    Engineering (2011), measure the angle a from the hanging rod.
     """
 
     GRAVITY = 9.81
@@ -247,7 +248,7 @@ TASK = Task(
             (-25.0, 0.0, 25.0),
             (-35.0, 0.0, 35.0),
         ),
-        # In this run the rod swings through below its hinge.
+        # In this run the rod swings through its lowest position.
         start=(0.2, 2.0, 0.0, 0.0),
         steps=20,
         balanced_steps=4,

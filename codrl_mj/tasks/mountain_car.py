@@ -12,7 +12,7 @@ along x is 0.001 F - 0.0025 cos(3 x), in m/s^2 with F in N: a car of 1000 kg.
 | 0 | `position` | -1.2 | 0.6 | m |
 | 1 | `velocity` | -0.07 | 0.07 | m/s |
 
-Every integration step keeps these bounds; the left wall stops the car.
+These bounds hold after every integration step; the left wall stops the car.
 
 ## Action space
 
@@ -32,8 +32,9 @@ At the end of a step x >= 0.5 m with v >= 0, which is success. Truncated after 2
 
 ## Arguments
 
-[The arguments of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. Semi-implicit
-Euler is Gymnasium's, twenty steps with a motor the paper's choice.
+[The arguments of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. The integrator
+is semi-implicit Euler, as in Gymnasium. With a motor an environment step has twenty integration
+steps, as in the paper.
 """
 
 from typing import Any
@@ -111,7 +112,7 @@ class ReferenceEnv(GymnasiumReferenceEnv):
 
         Args:
             source: id of the environment from which the strength is taken.
-            strength: its attribute that is the acceleration per force [m/s^2 per N].
+            strength: name of its attribute for the acceleration per force [m/s^2 per N].
         """
         super().__init__()
         self._strength = strength
@@ -123,7 +124,7 @@ class ReferenceEnv(GymnasiumReferenceEnv):
         """Take a `step` to the right, with `force` set to the acceleration of either sign."""
         # The environment has only one integrator.
         del integrator
-        position, change = self.after(
+        position, change = self.state_after(
             (state[0], state[1] * timestep),
             2,
             force=force * getattr(self.env, self._strength) * timestep**2,
@@ -134,7 +135,7 @@ class ReferenceEnv(GymnasiumReferenceEnv):
 
 
 def attributes(goal: float, strength: str) -> dict[str, Attribute]:
-    """Return the attributes of both mountain cars; `strength` names that of 1/mass [1/kg]."""
+    """Return the attributes of a mountain car; the one named `strength` is 1/mass [1/kg]."""
     return {
         "min_position": Fixed(MIN_POSITION),
         "max_position": Fixed(MAX_POSITION),

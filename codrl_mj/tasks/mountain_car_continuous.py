@@ -33,8 +33,8 @@ At the end of a step x >= 0.45 m with v >= 0, which is success. Truncated after 
 
 ## Arguments
 
-[The arguments of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. Integrated as
-MountainCar.
+[The arguments of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. The
+integration is the same as in MountainCar.
 """
 
 import dataclasses
@@ -72,8 +72,8 @@ TASK = dataclasses.replace(
     reward_threshold=90.0,
     agent="ddpg",
     gymnasium_id="MountainCarContinuous-v0",
-    # Gymnasium's MountainCarContinuousEnv has the same equations, but its gravity is no attribute
-    # that could be scaled, and it rounds its state to float32.
+    # Gymnasium's MountainCarContinuousEnv has the same equations, but its gravity is not an
+    # attribute, so it cannot be scaled, and it rounds its state to float32.
     reference_env=functools.partial(mountain_car.ReferenceEnv, "MountainCarContinuous-v0", "power"),
     asset="mountain_car_continuous.xml",
     max_force=FORCE,

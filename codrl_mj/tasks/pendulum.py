@@ -10,15 +10,15 @@ pivot, too weakly to lift the rod in one go.
 | index | observation | min | max | unit |
 | --- | --- | --- | --- | --- |
 | 0 | `cos_angle`, height of the tip | -1 | 1 | m |
-| 1 | `sin_angle`, how far left the tip is | -1 | 1 | m |
+| 1 | `sin_angle`, position of the tip to the left | -1 | 1 | m |
 | 2 | `angular_velocity` | -8 | 8 | rad/s |
 
-The angle theta is 0 upright and grows counter-clockwise; the state's is not wrapped.
+The angle theta is 0 upright and grows counter-clockwise; in the state it is not wrapped.
 
 ## Action space
 
-`Box(-2, 2, (1,), float32)`: the desired torque [N*m]; it saturates at +-2. To compare with
-Gymnasium to rounding give float64 actions.
+`Box(-2, 2, (1,), float32)`: the desired torque [N*m]; it saturates at +-2. To match
+Gymnasium up to rounding errors, pass float64 actions.
 
 ## Reward
 
@@ -38,7 +38,7 @@ within 0.1 rad of upright and slower than 0.1 rad/s.
 ## Arguments
 
 [The arguments of every environment](arguments.md); Gymnasium's `g` is the model's gravity.
-Semi-implicit Euler is the installed Gymnasium's (the paper says explicit).
+The integrator is semi-implicit Euler, as in the installed Gymnasium (the paper says explicit).
 """
 
 import math
@@ -126,7 +126,7 @@ class ReferenceEnv(GymnasiumReferenceEnv):
         """Take a `step` with the torque as a float64 action, which Gymnasium does not round."""
         # The environment has only one integrator.
         del integrator
-        return self.after(state, np.array([force]), dt=timestep, max_torque=np.inf)
+        return self.state_after(state, np.array([force]), dt=timestep, max_torque=np.inf)
 
 
 TASK = Task(

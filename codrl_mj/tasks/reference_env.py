@@ -1,6 +1,6 @@
-"""Reference of a task for the certificate: an environment to compare with, and states to try.
+"""Independent reference for a task's dynamics, and the states in which to compare the two.
 
-The environment is mostly one of the installed Gymnasium, unmodified and driven through its
+Most references are environments of the installed Gymnasium, unmodified and controlled through their
 attributes.
 """
 
@@ -15,8 +15,8 @@ class ReferenceEnv(Protocol):
 
     The class is constructed without arguments. If it has a Gymnasium environment as `env`, the
     analytic physics reads and writes that environment's numbers. A method `derivative(state,
-    force)` may return the state's time derivative, shape (n,), with which the certificate then
-    compares the model's.
+    force)` may return the state's time derivative, shape (n,); the certificate then compares
+    it with that of the model.
     """
 
     def __call__(
@@ -35,7 +35,8 @@ class ReferenceEnv(Protocol):
 class GymnasiumReferenceEnv:
     """Base of references that are Gymnasium environments.
 
-    A subclass sets `env_id`, and defines how a force gets into the environment's `step`.
+    A subclass sets `env_id` and defines `__call__`, which applies a force in the environment's
+    `step`.
     """
 
     env_id: str
@@ -44,7 +45,7 @@ class GymnasiumReferenceEnv:
         """Create the environment."""
         self.env = make_gymnasium_env(self.env_id)
 
-    def after(self, state: Any, action: Any, **attributes: Any) -> Any:
+    def state_after(self, state: Any, action: Any, **attributes: Any) -> Any:
         """Return the state after one `step` from a state, with attributes set during the step."""
         previous = {name: getattr(self.env, name) for name in attributes}
         try:
@@ -66,22 +67,22 @@ def make_gymnasium_env(env_id: str) -> Any:
 
 
 class ReferenceStates(NamedTuple):
-    """States in which the certificate tries a task, in the units of the task's state."""
+    """States in which the certificate compares a task with its reference, in the state's units."""
 
     bounds: tuple[float, ...]
     """Half widths of the range from which states are drawn uniformly."""
     edges: tuple[tuple[float, ...], ...]
-    """Values of each state entry on and beside walls, speed limits and the cut of angles."""
+    """Values of each state entry at and beside walls, speed limits and the wrap of angles."""
     start: tuple[float, ...]
-    """Start of a run without bounds, walls and wrapped angles, so that the equations are smooth."""
+    """Initial state of a run that reaches no wall, limit or wrap, so the equations are smooth."""
     steps: int
-    """Environment steps of that run."""
+    """Number of environment steps of that run."""
     balanced_steps: int
-    """Number of its first steps over which the energy balance is checked, with much finer steps."""
+    """Environment steps of that run in which energy is balanced, with short integration steps."""
     horizon: int | None = None
-    """Environment steps over which two implementations must agree to 1e-9; None for a whole
-    episode. Rounding errors of a chaotic task, 1e-16 * exp(lambda t), exceed 1e-9 within an
-    episode.
+    """Number of environment steps over which two implementations must agree to 1e-9; None for a
+    whole episode. In a chaotic task rounding errors grow as 1e-16 * exp(lambda t), and can exceed
+    1e-9 within an episode.
     """
 
 

@@ -15,7 +15,7 @@ TASKS: dict[str, Task] = {}
 
 
 def register(task: Task) -> Task:
-    """Register a task: `gymnasium.make` then takes its id, and functions and commands its name.
+    """Register a task, so that `gymnasium.make` accepts its id, and commands accept its name.
 
     A repeated call with the same task does nothing.
 
@@ -54,10 +54,10 @@ def register(task: Task) -> Task:
 
 
 def reference_of(task: Any, home: str | None = None) -> str:
-    """Return a text that finds a task or env source in any process.
+    """Return a name under which any process can find a task or env source.
 
-    It is the name of a built-in task, and `module:NAME` of a custom one. If no module has the task,
-    it is the task's name, which only processes that have registered the task can resolve.
+    This is the name of a built-in task, or `module:NAME` of a custom one. For a custom task that is
+    no module's variable it is the task's name, which works only in processes that registered it.
 
     Args:
         task: the task or env source.
@@ -75,7 +75,7 @@ def reference_of(task: Any, home: str | None = None) -> str:
 
 
 def find_task(name: str) -> Task:
-    """Return the task of a name.
+    """Return the task with a name.
 
     Args:
         name: a key of `TASKS`, or `module:NAME` of a custom task, which is imported and registered.

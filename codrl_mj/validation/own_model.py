@@ -37,7 +37,7 @@ from codrl_mj.engine.reading import actuators_sharing_motor, motor_slots
 from codrl_mj.engine.specs import describe_duplicate_dynamics
 from codrl_mj.physics import SimulationConfig, install_callbacks, motors
 from codrl_mj.physics.mjcf import task_model
-from codrl_mj.physics.variation import without_motors
+from codrl_mj.physics.variation import without_additions
 from codrl_mj.tasks import find_task, resolve_actuators
 from codrl_mj.validation.compare import FALLBACK_ACTUATOR, paper_actuators
 from codrl_mj.validation.execution import UNIT, commands, differs
@@ -227,7 +227,7 @@ def motor_checks(model: mujoco.MjModel, quick: bool) -> Iterator[Check | Skipped
             f"actuators {', '.join(without_motor)}",
             "not motors of codrl_mj, which does not change them",
         )
-    for text in describe_duplicate_dynamics(without_motors(model, ours), ours):
+    for text in describe_duplicate_dynamics(without_additions(model, ours), ours):
         yield Skipped(
             "whether a motor is counted twice", f"a compiled model does not show it: {text}"
         )

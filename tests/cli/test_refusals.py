@@ -34,7 +34,7 @@ REFUSED = [
     ("render pendulm", "no run configuration at pendulm/config.json: did you mean 'pendulum'?"),
     (
         "train CartPole-v1",
-        "has no MuJoCo model built from XML, and so no motors: use 'cartpole', the task of this package",
+        "has no MuJoCo model built from XML, and so no motors: use this package's task 'cartpole'",
     ),
     ("train cartpole more", "unexpected 'more': codrl-mj train --help"),
     ("train cartpole --seed", "--seed needs a value: a whole number"),

@@ -523,7 +523,7 @@ def test_raises_for_a_bad_reset_of_a_batch_and_changes_nothing(arguments, messag
 @pytest.mark.parametrize("make", [ActuatedEnv, functools.partial(ActuatedVectorEnv, 2)])
 def test_raises_for_reset_options_out_of_order(make, value):
     with pytest.raises(
-        ValueError, match=re.escape(f"reset options = {{'x_init': {value}}}: give bounds [")
+        ValueError, match=re.escape(f"reset options = {{'x_init': {value}}}: the bounds are [")
     ):
         make("pendulum").reset(seed=0, options={"x_init": value})
 

@@ -196,7 +196,7 @@ def test_rendering_shows_the_first_environment(physics):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"env_id": "Pendulum-v1"}, "no MuJoCo model .* use 'pendulum', the task of this package"),
+        ({"env_id": "Pendulum-v1"}, "no MuJoCo model .* use this package's task 'pendulum'"),
         ({"num_envs": 0}, "num_envs = 0"),
         ({"num_envs": 0, "physics": "analytic"}, "num_envs = 0"),
         ({"physics": "newton"}, "unknown physics 'newton'"),
