@@ -29,11 +29,13 @@ class OffPolicyConfig(DeepAgentConfig):
     learning_starts: int = integer(1000, minimum=0)
     """Environment steps of uniformly random actions before learning, >= 0."""
     train_every: int | None = integer(1, minimum=1, optional=True)
-    """Steps of each environment between trainings, >= 1; None: one training after
-    each episode, which requires `num_envs` = 1."""
+    """Steps of each environment between trainings, >= 1; None: one training after each
+    episode, which requires `num_envs` = 1.
+    """
     gradient_steps: int | None = integer(None, minimum=1)
     """Gradient steps per training, >= 1; None: as many as the environment steps since the last
-    training."""
+    training.
+    """
 
     def make_model(self, env: Any, seed: int) -> Any:
         """See `AgentConfig.make_model`."""

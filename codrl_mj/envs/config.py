@@ -45,7 +45,8 @@ class EnvConfig:
     """
     physics: str = "mujoco"
     """`mujoco`; `analytic` (Gymnasium's equations; Furuta: a closed form); or the name of a
-    registered physics."""
+    registered physics.
+    """
     integrator: str | None = None
     """One of the task's integrators (CartPole: `euler`, `semi-implicit`); default: Gymnasium's."""
     inner_steps: int | None = None
