@@ -243,7 +243,7 @@ def load_module(text: str) -> Any:
         ):
             raise ValueError(
                 f"{text!r}: {error}; must be module:NAME, where the module is installed or in the"
-                f" present folder, {Path.cwd()}; the command line also accepts FILE.py:NAME"
+                f" current folder, {Path.cwd()}; the command line also accepts FILE.py:NAME"
             ) from None
         location, is_package_error = _origin(error)
         description = (

@@ -141,19 +141,19 @@ def index() -> str:
     )
     return (
         '# Environments\n\nChoose a task: `gymnasium.make("codrl_mj/Pendulum-v0")`, after `import'
-        " codrl_mj`. All take [the same arguments](arguments.md).\n\n| environment | task |\n| ---"
-        f" | --- |\n{rows}\n"
+        " codrl_mj`. All environments take [the same arguments](arguments.md).\n\n"
+        f"| environment | task |\n| --- | --- |\n{rows}\n"
     )
 
 
 def arguments() -> str:
     """Return the Markdown page on the arguments of all environments."""
     return (
-        "# Arguments of every environment\n\nSay what the force goes through, and how it is"
-        ' simulated.\n\n```python\nimport codrl_mj\n\nenv = codrl_mj.make("cartpole",'
-        ' actuator="weak", observe_actuator=True)\n```\n\n`gymnasium.make` takes the same, and so'
-        " do command lines: `--env.observe-actuator`. A task's own options are on [its"
-        f" page](README.md).\n\n{common_arguments()}\n"
+        "# Arguments of every environment\n\nThese arguments select the actuator and configure the"
+        ' simulation.\n\n```python\nimport codrl_mj\n\nenv = codrl_mj.make("cartpole",'
+        ' actuator="weak", observe_actuator=True)\n```\n\n`gymnasium.make` takes the same'
+        " arguments; on the command line they are flags: `--env.observe-actuator`. [The page of a"
+        f" task](README.md) lists its own options.\n\n{common_arguments()}\n"
     )
 
 

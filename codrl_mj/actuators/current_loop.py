@@ -110,8 +110,8 @@ class Supply(Checked):
     """
 
     voltage: float = real(math.inf, above=0.0, unit="V", infinite=True)
-    """Open-circuit voltage [V], > 0; the controller's `max_voltage` limits the terminal voltage,
-    too. `inf`: equal to the controller's `max_voltage`.
+    """Open-circuit voltage [V], > 0. The controller's `max_voltage` also limits the terminal
+    voltage; with `inf` it is the only limit.
     """
     resistance: float = real(0.0, minimum=0.0, unit="ohm")
     """Internal resistance [ohm], >= 0: the available voltage drops by resistance*|current|."""
@@ -286,7 +286,8 @@ class DCMotorActuator(ActuatorModel):
     controller: CurrentLoop = CurrentLoop()
     """The current loop and its sensor."""
     supply: Supply | None = part(Supply())
-    """Supply of the drive; None: `controller.max_voltage` at any current."""
+    """Supply of the drive. None: an ideal supply; only `controller.max_voltage` limits the voltage.
+    """
 
     @property
     def arm_radius(self) -> float:

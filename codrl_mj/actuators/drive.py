@@ -219,7 +219,7 @@ class Drive(ActuatorModel):
     controller: SampledLoop = SampledLoop()
     """The current loop."""
     supply: Supply | None = part(Supply(voltage=24.0))
-    """Supply of the drive; None: 24 V without a resistance."""
+    """Supply of the drive. None: an ideal supply of 24 V."""
 
     @classmethod
     def from_motor_parameters(cls, parameters: Any) -> "Drive":

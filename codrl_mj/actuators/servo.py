@@ -29,7 +29,7 @@ class ServoLoop(Checked):
     """
 
     controls: str = choice("position", "position", "velocity")
-    """Controlled quantity, in which commands are given."""
+    """Controlled quantity, which is also the quantity of the commands."""
     servo_rate: float = real(1e3, above=0.0, unit="Hz")
     """Sample rate [Hz] of these loops, > 0; it must divide the drive's `sample_rate`, and be a
     multiple or a divisor of the mechanical step's rate.

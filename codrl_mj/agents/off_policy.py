@@ -29,9 +29,13 @@ class OffPolicyConfig(DeepAgentConfig):
     learning_starts: int = integer(1000, minimum=0)
     """Environment steps of uniformly random actions before learning, >= 0."""
     train_every: int | None = integer(1, minimum=1, optional=True)
-    """Steps of each environment between trainings, >= 1; None: an episode, with `num_envs` = 1."""
+    """Steps of each environment between trainings, >= 1; None: one training after each
+    episode, which requires `num_envs` = 1.
+    """
     gradient_steps: int | None = integer(None, minimum=1)
-    """Gradient steps of a training, >= 1; None: one for each environment step since the last."""
+    """Gradient steps per training, >= 1; None: as many as the environment steps since the last
+    training.
+    """
 
     def make_model(self, env: Any, seed: int) -> Any:
         """See `AgentConfig.make_model`."""
@@ -132,12 +136,12 @@ class DDPGConfig(ActorCriticConfig):
     actor_units: tuple[int, ...] = positive_integers((64, 64))
     """Units of the actor's hidden layers. The paper: 64-64."""
     state_units: tuple[int, ...] = positive_integers((16, 32))
-    """Units of the critic's layers for the state only; () passes the state on. The paper: 1
-    (pendulum), 64 (car).
+    """Units of the critic's layers for the state only; () passes the state on unchanged. The paper:
+    1 (pendulum), 64 (car).
     """
     action_units: tuple[int, ...] = positive_integers((32,))
-    """Units of the critic's layers for the action only; () passes the action on. The paper: 32
-    (pendulum), () (car).
+    """Units of the critic's layers for the action only; () passes the action on unchanged. The
+    paper: 32 (pendulum), () (car).
     """
     joint_units: tuple[int, ...] = positive_integers((256, 256))
     """Units of the critic's hidden layers behind the merged state and action layers. The paper:

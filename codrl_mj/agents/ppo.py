@@ -62,11 +62,12 @@ class PPOConfig(DeepAgentConfig):
     step.
     """
     noise_steps: int | None = integer(None, minimum=1)
-    """Steps between two draws of the state-dependent noise, >= 1; None: one draw a rollout."""
+    """Steps between two draws of the state-dependent noise, >= 1; None: one draw per rollout."""
 
     unit_actions: bool = flag(False)
     """Continuous actions: the actor's mean and noise are in units of the largest action, so that
-    one setting learns by torque, current or voltage. Not with `state_dependent_noise`.
+    the same settings suit commands in torque, current and voltage. Not with
+    `state_dependent_noise`.
     """
 
     def __post_init__(self) -> None:

@@ -38,7 +38,7 @@ VERB_HELP: dict[str, tuple[str, str]] = {
     "report": ("Write a report of a run as one HTML file.", "runs/mine --out mine.html"),
     "motor": ("List off-the-shelf motors, show one, design its loop, choose one.", "list"),
     "advise": (
-        "Advise what to do about an actuator before you train.",
+        "Recommend what to do about an actuator before you train.",
         "weak pendulum",
     ),
     "identify": ("Identify a motor from its bench logs.", "check swing.csv --columns time=t:s"),
@@ -49,7 +49,10 @@ VERB_HELP: dict[str, tuple[str, str]] = {
     "cache": ("Show or clear the cache of compiled code.", "--clear"),
     "export": ("Export a policy as ONNX and C, with all its assumptions.", "runs/mine --out mine"),
     "board": ("Run exported C code as a controller, or check its log.", "test mine"),
-    "validate": ("Certify that the port to MuJoCo is correct.", "cartpole --out certificate"),
+    "validate": (
+        "Check the simulation against independent references.",
+        "cartpole --out certificate",
+    ),
 }
 VERBS = {
     "train": "train:Train",
@@ -84,8 +87,8 @@ VERBS = {
 """Words of every verb -> its module, which is imported when the verb is called, and its class."""
 _DESCRIPTION = (
     "Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor."
-    " Every verb has its own --help; -h prints a shorter help. --version prints the version;"
-    " --traceback prints the traceback of an error."
+    " Every verb has its own --help; -h prints a shorter help. --version prints the version."
+    " With --traceback, an error prints its traceback."
 )
 
 
@@ -216,7 +219,7 @@ def _to_json_value(content: Any) -> Any:
 
 
 def _check_outputs(verb: Any) -> None:
-    """Raise an error before anything is computed if an output path cannot be written."""
+    """Raise an error if an output path cannot be written, before anything is computed."""
     kind = type(verb).__name__
     checks = {
         "out": _OUTPUT_FILE_CHECKS.get(kind, check_writable),

@@ -15,7 +15,7 @@ _DELIVERED = {
     "lag": ("lag, as a first-order time constant", "policy steps", ".3g"),
     "dead_time": ("dead time", "policy steps", ".3g"),
     "at_rest": ("delivered share of the largest force, at rest", "", ".0%"),
-    "at_speed": ("delivered share of it, at the reference speed", "", ".0%"),
+    "at_speed": ("delivered share of the largest force, at the reference speed", "", ".0%"),
     "friction": ("friction", "largest force", ".3g"),
     "noise": ("noise of the force", "largest force", ".3g"),
     "unasked": ("force at a command of zero", "largest force", ".3g"),
@@ -24,13 +24,13 @@ _DELIVERED = {
 
 @dataclasses.dataclass(frozen=True)
 class Advise:
-    """Advise what to do about an actuator: train on ideal forces, tune, randomize, or replace it.
+    """Recommend what to do about an actuator: train on ideal forces, tune, randomize or replace it.
 
-    A bench test measures the delay, the size and the noise of the force that the actuator delivers
-    when it is commanded the task's largest force. The study's results tell how much policies lose
-    by that (docs/advise.md). --measure trains policies on ideal forces, on random actuators and
-    through this actuator, and tests them on it, which takes minutes. If it is interrupted, the same
-    command continues.
+    A simulated bench test commands the task's largest force and measures the delay, the size and
+    the noise of the force that the actuator delivers. The results of a study tell how much score
+    such errors cost policies (docs/advise.md). --measure trains policies on ideal forces, on random
+    actuators and through this actuator, and tests all of them on this actuator. This takes minutes;
+    if you interrupt it, the same command continues.
 
     Example: codrl-mj advise maxon-ec45-flat-50w pendulum --gear-ratio 20, or codrl-mj advise paper
     cartpole --measure 5
@@ -52,7 +52,7 @@ class Advise:
         tyro.conf.arg(
             metavar="TASK",
             help=(
-                "One of the study's tasks, such as pendulum; with --measure also a custom task"
+                "One of the tasks of the study, such as pendulum; with --measure also a custom task"
                 " (module:NAME), an environment (HalfCheetah-v5), or a run folder, whose"
                 " environment, agent and training length are used."
             ),
@@ -63,13 +63,14 @@ class Advise:
     voltage: float | None = None
     """Voltage of the supply [V]; default: the motor's nominal voltage."""
     measure: int | None = None
-    """Number of policies to train in each way, at least 2, and to test on the actuator."""
+    """Number of policies that are trained in each way and tested on the actuator, at least 2."""
     root: Path = Path("runs/advise")
-    """Folder of the run folders of --measure."""
+    """Folder in which --measure creates its run folders."""
     jobs: int = -1
     """Number of trainings at the same time; -1: one for each CPU."""
     evidence: Path | None = None
-    """The study's runs.csv; default: the installed one."""
+    """Table of results, with the columns of the study's runs.csv; default: the installed runs.csv.
+    """
     trust: Trust = False
     as_json: AsJson = False
 
@@ -87,7 +88,9 @@ class Advise:
                 " --measure 5"
             )
         if self.measure is not None and self.measure < 2:
-            raise ValueError(f"--measure {self.measure}: must be >= 2, or there is no interval")
+            raise ValueError(
+                f"--measure {self.measure}: must be >= 2, because an interval needs two policies"
+            )
         actuator_spec: Any = self.actuator
         if self.gear_ratio is not None or self.voltage is not None:
             motor = {} if self.gear_ratio is None else {"motor": {"gear_ratio": self.gear_ratio}}

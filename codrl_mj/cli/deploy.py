@@ -30,8 +30,8 @@ class Export:
     """Export a trained policy as ONNX and C99, with all its assumptions in contract.json.
 
     The contract lists names, units, order and range of observations and actions, the rate, the
-    actuator, the delays, and the reaction to missed deadlines. It also holds 200 observations of
-    episodes with the policy's actions, so that other programs can be checked against them
+    actuator, the delays, and the reaction to missed deadlines. It also contains 200
+    observations from episodes, with the policy's actions, as a reference for other programs
     (docs/deploy.md).
 
     Example: codrl-mj export runs/furuta-ppo-ideal-0 --out furuta
@@ -42,8 +42,8 @@ class Export:
         tyro.conf.arg(
             metavar="RUN",
             help=(
-                "Run folder; or a folder with only a policy, or a Stable-Baselines3 zip: these need"
-                " --task and the other settings of their training, such as --env.action voltage."
+                "Run folder, a folder with only a policy, or a Stable-Baselines3 zip. The last two"
+                " need --task and the settings of their training, such as --env.action voltage."
             ),
         ),
     ]
@@ -52,14 +52,15 @@ class Export:
     out: Path = Path("exported")
     """Folder to write; it must be empty or not exist."""
     episodes: int = 5
-    """Number of episodes that are run for the contract's ranges and reference values."""
+    """Number of episodes from which the contract takes ranges and reference values."""
     seed: int = 0
     """Seed of the first episode; each further episode uses the next integer."""
     float64: bool = False
     """Compute with double instead of float in the C code."""
     limit: tuple[str, ...] = ()
-    """Largest safe magnitudes of observations, such as arm_velocity=30 arm=1.8. Beyond them the
-    board sends the safety command. An angle that is observed as cos_arm and sin_arm is called arm.
+    """Largest safe magnitudes of observations, such as arm_velocity=30 arm=1.8. Beyond them, the
+    board applies the safe command. The name of an angle that is observed as cos_arm and sin_arm is
+    arm.
     """
     board: str | None = None
     """Board whose memory and speed are checked: arduino-uno, arduino-due, nucleo-f446re,
@@ -142,8 +143,8 @@ class Test:
     """Run the exported C code as the controller of the simulation, compared with the ONNX model.
 
     The C code is compiled for this machine, or for a Cortex-M4F that QEMU emulates. The exit status
-    is 1 if fewer than 95 % of the returns are within 1 % of Python's, unless frames are corrupted
-    or the motor is changed on purpose.
+    is 1 if fewer than 95 % of the returns are within 1 % of those in Python. It is 0 in any case if
+    you corrupt frames or change the motor.
 
     Example: codrl-mj board test furuta --target cortex-m4f
     """
@@ -156,7 +157,7 @@ class Test:
     seed: int = 0
     """Seed of the first episode; each further episode uses the next integer."""
     loop: bool = True
-    """Let the C code also close the motors' current loop, sample by sample, if it has one."""
+    """Let the C code also close the motors' current loop, sample by sample, if it contains one."""
     actuator: str | None = None
     """Motor in the simulation, by name or file; default: the policy's."""
     lost: float = 0.0
@@ -164,7 +165,7 @@ class Test:
     damaged: float = 0.0
     """Share of the frames in which one bit is flipped."""
     late: float = 0.0
-    """Share of the answers that arrive one period late: the previous command is held."""
+    """Share of the answers that arrive one period late. Until then the previous command is held."""
     counts: int = 0
     """Encoder counts per turn, such as 2048; 0: exact."""
     current_bits: int = 0
@@ -172,10 +173,10 @@ class Test:
     pwm_bits: int = 0
     """Resolution [bit] of the bridge's voltages; 0: exact."""
     film: Path | None = None
-    """Film of the first episode with the board as the controller: .mp4 or .gif."""
+    """File for a film of the first episode with the board as the controller: .mp4 or .gif."""
     log: Path | None = None
-    """CSV file for the observations and commands of the board in the first episode; `board check`
-    reads it.
+    """CSV file for the observations and commands of the board in the first episode. `board check`
+    reads this file.
     """
     trust: Trust = False
 
@@ -224,8 +225,8 @@ class Test:
             ),
             ("observations beyond the limits", f"{result.beyond_limits}"),
             ("samples of the current loop", f"{result.samples or 'none'}"),
-            ("frames and samples a second", f"{result.rate:.0f}"),
-            ("instructions of a policy step, a sample", instructions),
+            ("frames and samples per second", f"{result.rate:.0f}"),
+            ("instructions per policy step, per sample", instructions),
         ]
         print_table(f"{self.folder} as C on {self.target}", ("", ""), rows)
         if self.log is not None:
@@ -239,7 +240,7 @@ class Test:
             ) as board_policy:
                 env = board_policy.rig
                 panel = record(board_policy, env, self.seed, 640, 480)
-            title = f"{env.task} by its C on {self.target}: return {panel.episode.total:.0f}"
+            title = f"{env.task} with C code on {self.target}: return {panel.episode.total:.0f}"
             film([dataclasses.replace(panel, title=title)], self.film, 640, 480)
             print(f"wrote {self.film}")
         return int(
@@ -253,8 +254,9 @@ class Test:
 class CheckLog:
     """Check a controller's log against the contract: names, order, units, rate, ranges, commands.
 
-    The log has comma-separated columns `name:unit`: time:s, the observations in their order, the
-    commands. The exit status is 1 if commands differ from the policy's or came late.
+    The columns of the log are named `name:unit` and separated by commas: time:s, the observations
+    in the order of the contract, and the commands. The exit status is 1 if commands differ from
+    those of the policy or came late.
 
     Example: codrl-mj board check furuta swing.csv
     """
@@ -275,23 +277,23 @@ class CheckLog:
         rows = [
             ("rows; rate", f"{check.rows}; {check.rate:.4g} Hz"),
             ("came late", str(check.late)),
-            ("outside of what the policy saw", outside or "none"),
+            ("observations outside the training's range", outside or "none"),
             (
-                "commands that are not the policy's",
+                "commands that differ from the policy's",
                 f"{check.differing}, by {check.worst:.2g} at most",
             ),
         ]
-        print_table(f"{self.log} by the contract of {self.folder}", ("", ""), rows)
+        print_table(f"{self.log} checked against the contract of {self.folder}", ("", ""), rows)
         return int(check.differing > 0 or check.late > 0)
 
 
 @dataclasses.dataclass(frozen=True)
 class RunBoard:
-    """Watch a real board at a serial port, or let it drive, and log its messages to a file.
+    """Watch a real board at a serial port, or let it drive the motor, and log its messages.
 
-    Without --drive the board only reports its observations and the commands that it would give. The
-    motor moves only with --drive, which ends by itself on an error, and always ends with the safety
-    command. Any key ends the run.
+    Without --drive, the board only reports its observations and the commands that it would give.
+    With --drive, the board moves the motor; the run then ends by itself on an error. Every run ends
+    with the safe command. Any key ends a run.
 
     Example: codrl-mj board run furuta --port /dev/ttyACM0 --out swing.csv
     """
@@ -302,11 +304,11 @@ class RunBoard:
     out: Path
     """CSV file for the log; `board check` and `identify` read it."""
     drive: bool = False
-    """Let the board give its commands to the motor."""
+    """Let the board apply its commands to the motor."""
     seconds: float = math.inf
     """Maximum duration [s]."""
     baud: int = 115_200
-    """Bits a second."""
+    """Baud rate of the serial port [bit/s]."""
 
     def run(self) -> int:
         """Run until a key is pressed, and print a summary."""
@@ -331,11 +333,12 @@ class RunBoard:
 
 @dataclasses.dataclass(frozen=True)
 class CompareLog:
-    """Simulate the commands of a rig's log, and compare the simulated observations with the rig's.
+    """Simulate a rig with the commands in its log, and compare the observations.
 
-    The simulation restarts from the rig's observation after each window. An error far below "if
-    nothing changed" means that the simulation describes the rig. Try --actuator with the file that
-    identify wrote as well as the motor of the training.
+    The simulation restarts from the rig's observation after each window. The column "if nothing
+    changed" is the error of a prediction that holds the observation constant; an error far below it
+    means that the simulation describes the rig. Compare the motor of the training with the file
+    that identify wrote: name it with --actuator.
 
     Example: codrl-mj identify compare runs/furuta swing.csv --actuator motor/actuator.yaml --out
     compared.png
@@ -345,7 +348,7 @@ class CompareLog:
         tyro.conf.Positional[Path],
         tyro.conf.arg(
             metavar="RUN",
-            help="Run folder, or its export: the environment of the training.",
+            help="Run folder or its export, for the environment of the training.",
         ),
     ]
     log: Annotated[
@@ -355,7 +358,8 @@ class CompareLog:
     actuator: str | None = None
     """Actuator in the simulation, by name or file; default: that of the training."""
     window: float | None = None
-    """Time [s] after which the simulation restarts; default: half a second, or ten rows."""
+    """Time [s] after which the simulation restarts; default: half a second, but at least ten rows.
+    """
     out: Path | None = None
     """PNG file for curves of the observed and simulated values."""
     trust: Trust = False

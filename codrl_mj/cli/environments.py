@@ -79,7 +79,7 @@ ActuatorName = Annotated[
         + "; a family with its defaults:"
         f" {', '.join(name for name in FAMILIES if name not in NAMED)}; an off-the-shelf motor"
         " (codrl-mj motor list), or a TOML file with its datasheet; a YAML file with the fields"
-        " of an actuator; or your own as module:NAME.",
+        " of an actuator; or your own actuator as module:NAME.",
     ),
 ]
 
@@ -90,17 +90,17 @@ Actuators = Annotated[
         help=(
             "Actuators of individual motors, which override --actuator and take the same names."
             " PATTERN is a regular expression that must match the whole name of the motor or its"
-            " joint. Patterns joined by & give the model's actuators of one joint a common motor."
-            " Instead of pairs, a YAML file of patterns and actuators, as codrl-mj motor choose"
-            " writes, is also accepted."
+            " joint. Join patterns by & to give several actuators of one joint a common motor."
+            " Instead of pairs, you can name a YAML file of patterns and actuators, such as"
+            " codrl-mj motor choose writes."
         ),
     ),
 ]
 FAMILY = "actuator.family"
 """Flag that `scan_flags` reads besides `actuator`."""
 _FAMILY_HELP = (
-    "Another family for the same motor: `servo` turns a motor or a datasheet into a servo, whose"
-    " command is a position."
+    "Another family for the same motor: `servo` turns a motor or a datasheet into a servo, which"
+    " takes a position as its command."
 )
 AS_TRAINED, AS_CONFIGURED = "as-trained", "as-configured"
 """Defaults of --actuator that do not name an actuator: the actuator of the policy's training, and

@@ -26,8 +26,8 @@ from codrl_mj.runs.files import write_json
 class Evaluate:
     """Measure a policy on any actuator: return, success, torque tracking, voltage, energy, heat.
 
-    For several motors a second table lists the measures of each motor. Several policies have one
-    row each, evaluated in the environment of their own training.
+    If there are several motors, a second table lists the measures of each. If you name several
+    policies, each has its own row and is evaluated in the environment of its training.
 
     Example: codrl-mj evaluate runs/cartpole-ppo-ideal-0 --actuator weaker --episodes 100
     """
@@ -51,7 +51,7 @@ class Evaluate:
     stochastic: bool = False
     """Sample the actions instead of taking the most likely ones."""
     out: Path | None = None
-    """JSON file for the result; with several policies, for all results by name."""
+    """JSON file for the result; for several policies, it contains all results by name."""
     as_json: AsJson = False
 
     for_line = classmethod(with_environment_flags)

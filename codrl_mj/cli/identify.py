@@ -41,14 +41,15 @@ _STYLES = {"error": "red", "warning": "yellow", "info": ""}
 
 @dataclasses.dataclass(frozen=True)
 class Identify:
-    """Identify a motor from its bench logs: parameters, 95 % intervals, and which are reliable.
+    """Identify a motor from its bench logs: parameters, 95 % intervals, and their reliability.
 
     Voltage and current determine the winding; torque, current or voltage, together with a position
-    or velocity, determine inertia, load and friction. The folder gets actuator.yaml, which
-    --actuator takes, result.json and report.html. Afterwards --env.randomize identified draws
-    within the intervals. If a parameter could not be identified, the exit status is 1 and there is
-    no actuator.yaml, until its value is given with --known. Run codrl-mj identify check, plan and
-    simulate first. docs/identify.md has more.
+    or velocity, determine inertia, load and friction. The files in the folder --out are
+    actuator.yaml, which --actuator accepts, result.json and report.html. A training with this
+    actuator and --env.randomize identified draws the parameters from their intervals. If an
+    actuator needs a parameter that the logs do not determine, there is no actuator.yaml and the
+    exit status is 1, until you give its value with --known. See also codrl-mj identify check, plan
+    and simulate, which prepare a fit, and docs/identify.md.
 
     Example: codrl-mj identify swing1.csv swing2.csv --columns
     time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad --rig pendulum --known mgl=2.81
@@ -59,33 +60,33 @@ class Identify:
     columns: Columns
     rig: Literal["pendulum", "free", "load"] | None = None
     """Load on the output: a pendulum that hangs at position 0, only an inertia (free), or an
-    inertia and a lifted load. A log without motion is of a locked rotor. Default: pendulum if
-    mgl is known.
+    inertia and a constant torque, such as a lifted weight (load). The rotor counts as locked in
+    logs without motion. Default: pendulum if mgl is known.
     """
     known: tuple[str, ...] = ()
-    """Values that are not fitted, as NAME=VALUE in SI units: mgl, inertia, load_inertia and
-    constant_torque at the output; the others (resistance, inductance, torque_constant,
-    back_emf_constant, gear_ratio, rotor_inertia, coulomb_friction, viscous_friction,
-    gear_efficiency, stribeck_friction, stribeck_speed) as the fields of a drive.
+    """Values that are not fitted, as NAME=VALUE in SI units. The values mgl, inertia, load_inertia
+    and constant_torque refer to the output. The others are the fields of a drive (resistance,
+    inductance, torque_constant, back_emf_constant, gear_ratio, rotor_inertia, coulomb_friction,
+    viscous_friction, gear_efficiency, stribeck_friction, stribeck_speed).
     """
     estimate: tuple[str, ...] = ()
-    """Parameters to fit that are otherwise fixed, such as torque_gain."""
+    """Parameters to fit that are fixed by default, such as torque_gain."""
     friction: Literal["auto", "coulomb", "stribeck", "load", "both"] = "coulomb"
-    """Viscous and Coulomb friction, or more terms; auto keeps terms that predict left-out logs
-    better.
+    """Friction model: coulomb (with viscous friction), stribeck, load (friction that grows with the
+    load), both, or auto, which adds the terms that improve the prediction of left-out logs.
     """
     segment: float = 0.5
-    """Duration [s] that the shaft is simulated without a restart: short if the rig is unstable, a
-    second or two if it only sticks and slides.
+    """Duration [s] of the simulated segments of a log. Use short segments if the rig is unstable,
+    and one or two seconds if the shaft only sticks and slides.
     """
     motor: str | None = None
-    """Motor of the catalogue, or a file, for the values that the logs do not determine."""
+    """Motor of the catalogue, or a datasheet file, for values that the logs do not determine."""
     holdout: tuple[Path, ...] = ()
     """Logs that are only predicted, not fitted."""
     out: Path | None = None
     """Folder for actuator.yaml, result.json, and report.html with plots of the fit."""
     ignore_errors: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Fit logs even if the checks find errors in them."""
+    """Fit the logs even if the checks find errors in them."""
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
@@ -232,7 +233,7 @@ def print_identification(result: Any) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class CheckLogs:
-    """Check bench logs before a fit: rows, sensors, delays, signs, units, ineffective parameters.
+    """Check bench logs before a fit: rows, sensors, delays, signs, units, undetermined parameters.
 
     The exit status is 1 if a log has errors that would make a fit wrong. Example: codrl-mj identify
     check log.csv --columns time=t:s,voltage=u:V,current=i:A,position=q:rad
@@ -241,10 +242,11 @@ class CheckLogs:
     logs: Logs
     columns: Columns
     motor: str | None = None
-    """Motor of the catalogue, or a file with a datasheet, to compare resistance and back-EMF with.
+    """Motor of the catalogue, or a file with a datasheet, whose resistance and back-EMF are
+    compared with the log.
     """
     rig: Literal["pendulum", "free", "load"] | None = None
-    """Load on the output, as for the fit; if it is not given, it may be a pendulum."""
+    """Load on the output, as for the fit. Without this flag, the checks allow for a pendulum."""
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
@@ -307,7 +309,7 @@ LOAD, SENSING, SAMPLER = (
 
 @dataclasses.dataclass(frozen=True)
 class PlanExperiment:
-    """Plan an experiment: excitation, sample rate and amplitude, and the errors to expect of each.
+    """Plan an experiment: excitation, amplitude and sample rate, with the expected errors.
 
     The errors are lower bounds for a motor that agrees with its datasheet; on a real bench they are
     several times larger. Example: codrl-mj identify plan maxon-ec45-flat-50w --inertia 1e-4 --out
@@ -322,11 +324,11 @@ class PlanExperiment:
     duration: float = 4.0
     """Duration of the log [s]."""
     max_current: float = math.inf
-    """Largest current [A] that the bench allows; the limits of the drive and of the datasheet apply
-    too.
+    """Largest current [A] that the bench allows. The limits of the drive and the datasheet also
+    apply.
     """
     out: Path | None = None
-    """Folder for excitation.csv, the voltage to play."""
+    """Folder for excitation.csv, the voltage to apply to the motor."""
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
@@ -414,11 +416,11 @@ _PARAMETER_SYMBOLS = {
 
 @dataclasses.dataclass(frozen=True)
 class SimulateLog:
-    """Simulate a bench log of a motor, with sensors, a sampler, and optional faults.
+    """Simulate a bench log of a motor, with sensors, a sampler and optional faults.
 
-    Prints the --columns that read the file. Example: codrl-mj identify simulate maxon-ec45-flat-50w
-    --out log.csv.gz --kind prbs --amplitude 12 --inertia 1e-4 --rate 5000 --sensor
-    current:noise=0.05 position:resolution=0.0015
+    The command prints the --columns that describe the file. Example: codrl-mj identify simulate
+    maxon-ec45-flat-50w --out log.csv.gz --kind prbs --amplitude 12 --inertia 1e-4 --rate 5000
+    --sensor current:noise=0.05 position:resolution=0.0015
     """
 
     name: MotorName
@@ -437,14 +439,14 @@ class SimulateLog:
     otherwise.
     """
     clock: float | None = None
-    """Clock period of a PRBS [s]; default: 4 L/R."""
+    """Clock period of a PRBS [s]; default: 4 L/R, four electrical time constants."""
     sampler: tyro.conf.OmitArgPrefixes[SAMPLER] = SAMPLER()  # type: ignore[valid-type]
     """Times at which rows are written."""
     sag: float = 0.0
-    """Resistance of the supply [ohm], which the logged voltage does not include."""
+    """Resistance of the supply [ohm]. The logged voltage does not include the drop across it."""
     sensor: tuple[str, ...] = ()
-    """SIGNAL:FIELD=VALUE,..., with the fields noise, resolution, bias (in SI), delay [s], gain and
-    outliers (share).
+    """Properties of a sensor as SIGNAL:FIELD=VALUE,..., with the fields noise, resolution and bias
+    (in SI units), delay [s], gain, and outliers (share of the rows).
     """
     seed: int = 0
     """Seed of noise, jitter and lost rows."""
@@ -503,9 +505,9 @@ def _sensors(texts: Sequence[str]) -> dict[str, Any]:
 class ProposeColumns:
     """Propose the --columns of a log from its names, units and values, and print the next command.
 
-    If neither the file nor its values tell a unit, it is printed as UNIT: replace it. The exit
-    status is 1 if nothing can be identified from the columns. Example: codrl-mj identify columns
-    log.csv
+    If the unit of a column is unknown, it is printed as UNIT; replace it by the unit. The exit
+    status is 1 if no parameter can be identified from these columns. Example: codrl-mj identify
+    columns log.csv
     """
 
     log: Annotated[tyro.conf.Positional[Path], _FILE]

@@ -17,7 +17,7 @@ MotorName = Annotated[
         metavar="NAME",
         help=(
             "A motor of the catalogue (codrl-mj motor list), a TOML file with a datasheet, a YAML"
-            " or JSON file with the fields of a drive, or your own as module:NAME."
+            " or JSON file with the fields of a drive, or your own motor as module:NAME."
         ),
     ),
 ]
@@ -78,11 +78,11 @@ _LIST_COLUMNS = {
 
 @dataclasses.dataclass(frozen=True)
 class List:
-    """List the motors of the catalogue with their abilities at nominal voltage.
+    """List the motors of the catalogue with their torque, speed and power at nominal voltage.
 
     Power is the maximum mechanical power. Continuous torque, stall torque and no-load speed are
     those of the gear's output, with friction subtracted; kT and J are those of the motor without
-    its gear. --json has more.
+    its gear. --json prints more columns.
 
     Example: codrl-mj motor list --sort power
     """
@@ -116,7 +116,9 @@ class List:
             whole=columns[:1],
             padding=(0, 0),
         )
-        print_text("at: nominal voltage. –: not on the datasheet; the voltage is then 24 V.")
+        print_text(
+            "at: nominal voltage, or 24 V if the datasheet has none. –: not on the datasheet."
+        )
         print("codrl-mj motor show NAME gives the source of each number")
         kinds = {name: KINDS.get(PRINTED_NAMES.get(name, name)) for name in rows[0]}
         units = ABILITY_UNITS | {
@@ -127,7 +129,7 @@ class List:
 
 @dataclasses.dataclass(frozen=True)
 class Show:
-    """Show a motor: every number with its unit and source, and the torque-speed diagram.
+    """Show every number of a motor with its unit and source, and the torque-speed diagram.
 
     The diagram shows the voltage limit (torque falls with speed, because the back-EMF uses up a
     part of the voltage), the peak current and the continuous current, at the output of the gear and
@@ -142,7 +144,7 @@ class Show:
     out: Path | None = None
     """Folder for torque_speed.png."""
     html: Path | None = None
-    """Page with these tables, the current loop and its steps: one .html file."""
+    """HTML file for a page with these tables, the current loop and its step responses."""
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
@@ -246,13 +248,13 @@ class Design:
     """Design the current loop: gains, margins, bandwidth and settling time, with and without delay.
 
     The zero of the PI controller cancels the pole of the winding, so that only the bandwidth is
-    left to choose. A larger bandwidth follows faster and tolerates less delay: a phase margin of 60
-    degrees is comfortable, 30 rings, 0 oscillates. A digital drive computes a voltage from one
-    sample and applies it in the next (--delayed), and the hold costs another half sample, so that a
-    larger bandwidth needs a higher sample rate. The margins include the delay and the hold. The
-    reported bandwidth is the -3 dB frequency of the closed loop, which exceeds the designed
-    bandwidth if a delayed loop overshoots. Settling time and overshoot are those of a small step of
-    the simulated drive.
+    left to choose. A loop with a larger bandwidth follows faster and tolerates less delay: at a
+    phase margin of 60 degrees the current settles well, at 30 it rings, at 0 it oscillates. A
+    digital drive computes a voltage from one sample and applies it in the next (--delayed), and the
+    hold costs another half sample, so that a larger bandwidth needs a higher sample rate. The
+    margins include the delay and the hold. The reported bandwidth is the -3 dB frequency of the
+    closed loop, which exceeds the designed bandwidth if a delayed loop overshoots. Settling time
+    and overshoot are those of a small step of the simulated drive.
 
     Example: codrl-mj motor design quanser-qube-servo-2 --bandwidth 1000 --delayed --out motor
     """
@@ -320,12 +322,12 @@ class Design:
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """Step the current: a small step, and one out of saturation with each kind of anti-windup.
+    """Simulate a small step of the current, and one from saturation with each anti-windup.
 
-    For 20 ms the reference is larger than the current that the voltage can drive against the
-    back-EMF; then it is smaller. Without anti-windup the controller's integral has grown in the
-    meantime and must unwind before the current falls (recovery). Clamping stops the integral;
-    back-calculation makes it follow the achievable current.
+    In the second step, the reference is for 20 ms larger than the current that the voltage can
+    drive against the back-EMF; then it is smaller. Without anti-windup, the controller's integral
+    has grown in the meantime and must unwind before the current falls (recovery). Clamping stops
+    the integral; back-calculation makes it follow the achievable current.
 
     Example: codrl-mj motor step quanser-qube-servo-2 --out motor
     """

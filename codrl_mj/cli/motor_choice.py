@@ -37,8 +37,8 @@ MotorOfRun = Annotated[
 class Feasible:
     """Check before training whether a motor can do a task (docs/motors.md).
 
-    The last line is the verdict: surely, it depends (on values that the datasheet lacks), try it,
-    hopeless or surely not. The exit status is 1 for the last two.
+    The last line is the verdict: "surely", "it depends" (on values that the datasheet lacks), "try
+    it", "hopeless" or "surely not". The exit status is 1 for the last two.
 
     Example: codrl-mj motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20
     """
@@ -47,7 +47,10 @@ class Feasible:
         tyro.conf.Positional[str],
         tyro.conf.arg(
             metavar="NAME",
-            help="A motor of the catalogue (codrl-mj motor list), or a file or module:NAME.",
+            help=(
+                "A motor of the catalogue (codrl-mj motor list), a file, or your own motor as"
+                " module:NAME."
+            ),
         ),
     ]
     task_or_run: TaskOrRun
@@ -147,13 +150,13 @@ class Feasible:
 class Choose:
     """Rank motors for a task, the smallest suitable one first, and say why others are unsuitable.
 
-    The exit status is 1 if none is suitable. Name custom motors (files) or motors of the catalogue
-    beside the task; without any, all motors of the catalogue are ranked. Each keeps the gear of its
-    datasheet, gets the best gear if it has none, or is judged with each of --gears. A motor is
-    suitable if the verdict of motor feasible is surely, with the margin; the smallest is the one
-    with the least maximum mechanical power at its supply. For a run with several motors one is
-    chosen for each of them. --out also writes actuators.yaml, which train, evaluate and render take
-    as --actuators FILE.
+    Before the task, name the motors to rank, from the catalogue or as files; the default is the
+    whole catalogue. Each motor keeps the gear of its datasheet, or gets the best gear if the
+    datasheet has none. With --gears, each motor is judged with each of these gears. A motor is
+    suitable if `motor feasible` would answer "surely" with --margin in reserve. The smallest motor
+    is the one with the least maximum mechanical power at its supply. If the run has several motors,
+    the command chooses one for each of them. --out also writes actuators.yaml, which train,
+    evaluate and render accept as --actuators FILE. The exit status is 1 if no motor is suitable.
 
     Example: codrl-mj motor choose pendulum --top 5 --out chosen, codrl-mj motor choose a.toml
     b.toml pendulum, codrl-mj motor choose a.toml pendulum --gears 6.25 18.75 30, or codrl-mj motor
@@ -179,13 +182,14 @@ class Choose:
     max_current: float | None = None
     """Current limit of the drive [A]; default: each motor's own."""
     gears: Annotated[tuple[float, ...], tyro.conf.arg(metavar="RATIO ...")] = ()
-    """Available gears, turns of the rotor per turn of the joint, or radians per meter: every motor
-    is judged with each of them. Default: the motor's own gear, or its best one if it has none.
+    """Available gear ratios [turns of the rotor per turn of the joint, or radians per meter]. Each
+    motor is judged with each of them. Default: the motor's own gear, or its best one if it has
+    none.
     """
     motor: MotorOfRun = None
     out: Path | None = None
-    """Folder for NAME.png of the motors in the table: demanded operating points and the motor's
-    limits.
+    """Folder for a diagram NAME.png of each motor in the table, with the demanded operating points
+    and the motor's limits.
     """
     trust: Trust = False
     as_json: AsJson = False

@@ -32,7 +32,7 @@ AsJson = Annotated[
     tyro.conf.FlagCreatePairsOff,
     tyro.conf.arg(
         name="json",
-        help="Print only JSON, in SI units unless another unit is given beside the number.",
+        help="Print only JSON, in SI units unless the output states another unit.",
     ),
 ]
 """Type of a field whose verb returns the exit status and the content to print as JSON."""
@@ -40,8 +40,8 @@ Trust = Annotated[
     bool,
     tyro.conf.arg(
         help=(
-            "Import custom modules that a run folder, a contract or an actuator's file names as"
-            " task, agent or actuator. This executes their code."
+            "Import the custom modules of a task, agent or actuator that a run folder, a contract"
+            " or an actuator's file names. This executes the code of their authors."
         )
     ),
 ]
@@ -200,7 +200,7 @@ def _expected_type(argument: Any) -> str:
 def normalize_arguments(arguments: Sequence[str]) -> list[str]:
     """Rewrite words: 1e5 and 20:1 as plain numbers, and FILE.py:NAME as module:NAME.
 
-    If the line names a module of the present folder, or has `--trust`, that folder is appended to
+    If the line names a module of the current folder, or has `--trust`, that folder is appended to
     `sys.path`. Modules that only a file names are still refused without `--trust`.
     """
     folder, words = Path.cwd(), []
@@ -224,7 +224,7 @@ def normalize_arguments(arguments: Sequence[str]) -> list[str]:
 
 
 def _module_name(file: Path, folder: Path) -> str:
-    """Return the importable module name of a file, relative to the present folder.
+    """Return the importable module name of a file, relative to the current folder.
 
     A run folder stores this name, so the same line finds the module again later.
     """
@@ -234,7 +234,7 @@ def _module_name(file: Path, folder: Path) -> str:
     parts = path.relative_to(folder).parts if path.is_relative_to(folder) else ("..",)
     if not all(part.isidentifier() for part in parts):
         raise ValueError(
-            f"{file}: must be in the present folder {folder} or below it, and the names of the"
+            f"{file}: must be in the current folder {folder} or below it, and the names of the"
             " file and its folders must be valid module names (letters, digits, _); otherwise"
             f" change to {path.parent} and name {file.name}"
         )

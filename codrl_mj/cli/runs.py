@@ -19,7 +19,7 @@ from codrl_mj.runs.summaries import SORT_KEYS, Comparison, RunSummary
 
 @dataclasses.dataclass(frozen=True)
 class Runs:
-    """List the runs of a folder, or compare some: differing settings, and results.
+    """List the runs of a folder, or compare the differing settings and the results of some runs.
 
     Example: codrl-mj runs runs --sort return, or codrl-mj runs --compare runs/one runs/other
     """
@@ -121,10 +121,12 @@ class Data:
 
     name: Annotated[
         tyro.conf.Positional[str | None],
-        tyro.conf.arg(metavar="NAME", help="Data set to download; without it, all are listed."),
+        tyro.conf.arg(
+            metavar="NAME", help="Data set to download; without a name, all data sets are listed."
+        ),
     ] = None
     out: Path = Path("data")
-    """Folder that gets bench_logs/NAME."""
+    """Folder in which bench_logs/NAME is created."""
 
     def run(self) -> int:
         """List the data sets, or download one."""

@@ -1,4 +1,4 @@
-"""`codrl-mj render`, `replay`, `view` and `report`: films, replay_parts, live views and reports."""
+"""`codrl-mj render`, `replay`, `view` and `report`: films, 3D replays, live views and reports."""
 
 import contextlib
 import dataclasses
@@ -39,14 +39,14 @@ class EpisodeVerb:
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
     actuator_name: ActuatorName = AS_TRAINED
     seed: int = 0
-    """Seed of the episode, or of the first one."""
+    """Seed of the episode; `view` uses it for the first episode."""
 
     for_line = classmethod(with_environment_flags)
 
 
 @dataclasses.dataclass(frozen=True)
 class Render(EpisodeVerb):
-    """Film one episode, with desired and actual torque and the voltage plotted below the scene.
+    """Film one episode, with plots of desired torque, actual torque and voltage below the scene.
 
     Example: codrl-mj render runs/cartpole-ppo-weaker-0 --out balance.mp4, or codrl-mj render
     cartpole (random actions).
@@ -110,7 +110,7 @@ class Render(EpisodeVerb):
 
 @dataclasses.dataclass(frozen=True)
 class Replay(EpisodeVerb):
-    """Write one episode as a web page in 3D, which can be turned, scrubbed and played at any speed.
+    """Write one episode as a 3D web page that you can rotate, scrub and play at any speed.
 
     Example: codrl-mj replay runs/cartpole-ppo-weaker-0 --out balance.html, or codrl-mj replay
     Ant-v5 (random actions).
@@ -244,8 +244,8 @@ class LiveView(EpisodeVerb):
 class Report:
     """Write a report of a run as one HTML file: learning, evaluation, a filmed episode with plots.
 
-    Several runs are shown side by side. For unfinished and damaged runs, the readable parts are
-    shown.
+    The report shows several runs side by side. Of unfinished and damaged runs, it shows the parts
+    that can be read.
 
     Example: codrl-mj report runs/cartpole-ppo-weaker-0 --out balance.html
     """
@@ -264,9 +264,11 @@ class Report:
     film: bool = True
     """Film the episode."""
     replay: bool = False
-    """Also show the episode in 3D, synchronized with the plots, which adds 0.7 MB."""
+    """Also show the episode in 3D, synchronized with the plots. This adds 0.7 MB to the file."""
     certificate: Path | None = None
-    """A certificate.json, or its folder, to summarize; default: the one in a run folder, if any."""
+    """Certificate to summarize: a certificate.json, or its folder. Default: the one in a run
+    folder.
+    """
     trust: Trust = False
 
     def run(self) -> int:

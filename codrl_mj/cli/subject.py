@@ -49,12 +49,15 @@ class Subject:
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """Facts about a policy that its folder does not contain."""
+    """Choice of a policy, and facts about it that its files do not contain."""
 
     which: Annotated[
         Literal["last", "best"],
         tyro.conf.arg(
-            help="Policy of a run: the last one, or that of the best evaluation in training."
+            help=(
+                "Policy of a run: the last one, or the one with the best evaluation during"
+                " training."
+            )
         ),
     ] = "last"
     task: Annotated[
@@ -83,9 +86,9 @@ class Source:
         bool,
         tyro.conf.arg(
             help=(
-                "Load a Stable-Baselines3 zip, which holds pickled objects; or import the custom"
+                "Load a Stable-Baselines3 zip, which contains pickled objects, or import the custom"
                 " modules of a run folder's task, agent or actuator. Both execute code of their"
-                " authors, so they need this flag. Other run folders of codrl-mj never need it."
+                " authors. Run folders without custom modules do not need this flag."
             )
         ),
     ] = False

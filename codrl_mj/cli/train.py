@@ -71,8 +71,8 @@ def train_verb(arguments: list[str]) -> Any:
                 tyro.conf.arg(
                     name="agent",
                     help=(
-                        "Learning agent. Its settings are below; those of others are listed by"
-                        " `codrl-mj train TASK --agent NAME --help`."
+                        "Learning agent. Its settings are below; `codrl-mj train TASK --agent NAME"
+                        " --help` lists those of another agent."
                     ),
                 ),
             ],
@@ -85,7 +85,7 @@ def train_verb(arguments: list[str]) -> Any:
                 tyro.conf.arg(
                     help=(
                         "Source of the defaults: `default` (ours), `paper` (as printed),"
-                        " `repaired` (the paper's, except for those that make training fail),"
+                        " `repaired` (the paper's, but ours where the paper's make training fail),"
                         " or `fast` (ours, for the shortest training)."
                     )
                 ),
@@ -118,13 +118,13 @@ class Train:
     """Train an agent through an actuator, and write a run folder.
 
     The folder gets the resolved configuration, tables of episodes and progress, checkpoints, the
-    best and the last policy (safetensors and JSON), an evaluation and the learning curve. Ctrl-C
-    writes a checkpoint and stops.
+    best and the last policy (safetensors and JSON), an evaluation and the learning curve. If you
+    press Ctrl-C, the training writes a checkpoint and stops.
 
     Example: codrl-mj train cartpole --actuator weaker --env.center-radius 0.1 --out
-    runs/through-weaker, and after an interruption codrl-mj train --resume runs/through-weaker.
-    Name other environments by their Gymnasium ids:
-    codrl-mj train HalfCheetah-v5 --actuators 'b.*=maxon-ec45-flat-50w' 'f.*=lag'
+    runs/through-weaker, and after an interruption codrl-mj train --resume runs/through-weaker. Name
+    other environments by their Gymnasium ids: codrl-mj train HalfCheetah-v5 --actuators
+    'b.*=maxon-ec45-flat-50w' 'f.*=lag'
     """
 
     config: Path | None = None
@@ -135,8 +135,8 @@ class Train:
     out: Path | None = None
     """Run folder to create; default: runs/TASK-AGENT-ACTUATOR-SEED."""
     resume: Path | None = None
-    """Run folder of an interrupted training, which continues from its last checkpoint. The result
-    is the same as without the interruption. No other flags are needed.
+    """Run folder of an interrupted training to continue from its last checkpoint. The result is
+    the same as without the interruption. No other flags are needed.
     """
     accept_changes: bool = False
     """Continue even if the code or a package has changed since the run was started."""
@@ -147,7 +147,7 @@ class Train:
     tensorboard: bool = True
     """Write events for TensorBoard, if it is installed."""
     wandb: str | None = None
-    """Weights & Biases project that also gets the reports."""
+    """Weights & Biases project to which progress is also reported."""
     as_json: AsJson = False
     for_line = staticmethod(train_verb)
 

@@ -17,9 +17,10 @@ from codrl_mj.validation import GROUPS, Certificate, Check, MutationResult
 
 @dataclasses.dataclass(frozen=True)
 class Validate:
-    """Certify that the port is correct: every check with its oracle, tolerance and worst case.
+    """Check tasks and motors against independent references, and write a certificate.
 
-    The exit status is 1 if a check fails.
+    The tables show the tolerance and the worst case of each check. The exit status is 1 if a check
+    fails.
 
     Example: codrl-mj validate cartpole --out certificate, or codrl-mj validate --model robot.xml
     (your own model with our motors).
@@ -29,17 +30,17 @@ class Validate:
         tyro.conf.Positional[tuple[str, ...]],
         tyro.conf.arg(
             metavar="{" + ",".join(TASKS) + "}",
-            help="Tasks to validate, or your own as module:NAME; default: all tasks.",
+            help="Tasks to validate, or your own task as module:NAME; default: all built-in tasks.",
         ),
     ] = ()
     model: Path | None = None
-    """MJCF file of your own with any number of our motors, added to the model or driven by the
-    control callback, to run the applicable checks on.
+    """Your own MJCF file, on which the applicable checks are run. It can have any number of our
+    motors, added to the model or run by the control callback.
     """
     quick: bool = False
-    """Fewer states, runs and step sizes: seconds instead of minutes."""
+    """Use fewer states, runs and step sizes, which takes seconds instead of minutes."""
     mutations: bool = False
-    """Also test the certificate: inject faults and list the checks that fail."""
+    """Also test the checks themselves: inject faults, and list the checks that detect them."""
     out: Path | None = None
     """Folder for the certificate: certificate.json, and certificate.html with plots."""
     as_json: AsJson = False

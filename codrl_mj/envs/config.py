@@ -44,7 +44,9 @@ class EnvConfig:
     tuple for a task with several motors, or as a mapping of patterns for a third-party environment.
     """
     physics: str = "mujoco"
-    """`mujoco`; `analytic` (Gymnasium's equations; Furuta: a closed form); or a registered name."""
+    """`mujoco`; `analytic` (Gymnasium's equations; Furuta: a closed form); or the name of a
+    registered physics.
+    """
     integrator: str | None = None
     """One of the task's integrators (CartPole: `euler`, `semi-implicit`); default: Gymnasium's."""
     inner_steps: int | None = None

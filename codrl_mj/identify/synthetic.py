@@ -26,7 +26,7 @@ class Excitation(Checked):
     """A voltage over time."""
 
     kind: str = "prbs"
-    """Kind of the voltage, a key of `EXCITATIONS`."""
+    """Waveform of the voltage, a key of `EXCITATIONS`."""
     amplitude: float = real(1.0, above=0.0, unit="V")
     """Amplitude of the voltage [V], > 0."""
     duration: float = real(4.0, above=0.0, unit="s")
@@ -126,9 +126,9 @@ class Sensor(Checked):
     delay: float = real(0.0, minimum=0.0, unit="s")
     """Delay [s] of the measured values, >= 0."""
     gain: float = real(1.0, unit="")
-    """Measured value over the true value; -1 is a wrong sign."""
+    """Ratio of the measured to the true value; -1: the sign is wrong."""
     bias: float = real(0.0, unit="")
-    """Measured value at a true value of 0, in the signal's unit."""
+    """Measured value if the true value is 0, in the signal's unit."""
     outliers: float = real(0.0, minimum=0.0, maximum=1.0)
     """Share of outliers, in [0, 1], which are off by 3 to 10 standard deviations of the signal."""
 
