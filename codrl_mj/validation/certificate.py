@@ -59,7 +59,7 @@ class Certificate:
     quick: bool
     """True for the quick form, which has fewer states, runs and step sizes."""
     seconds: float
-    """Duration of all checks [s]."""
+    """Total duration of the checks [s]."""
 
     @property
     def passed(self) -> bool:
@@ -207,7 +207,7 @@ def _likely_cause(check: Check) -> str:
 
 
 def _convert_errors(outcomes: Outcomes) -> Outcomes:
-    """Yield the results; a missing library skips the rest, a divergence is a failed check."""
+    """Yield the results; a missing library skips the rest, a divergence becomes a failed check."""
     try:
         yield from outcomes
     except ModuleNotFoundError as error:
@@ -291,8 +291,8 @@ def validate_model(
     """
     if not model.nactuator:
         raise ValueError(
-            f"the model has no actuators ({NO_ACTUATORS_READ}): add one per joint, put motors"
-            " behind them with codrl_mj.add_motors, and validate what it makes"
+            f"the model has no actuators ({NO_ACTUATORS_READ}): add one per joint, add motors"
+            " to them with codrl_mj.add_motors, and validate the resulting model"
         )
     if not motors(model):
         raise ValueError(

@@ -108,7 +108,7 @@ def compile_edited(module: types.ModuleType, edits: Sequence[Edit]) -> types.Mod
 
 
 _HIDDEN = np.zeros(64)
-"""Memory that all simulations share, one number for each actuator of a model."""
+"""Memory that a fault shares between all simulations, a number for each actuator of a model."""
 
 
 @cache
@@ -441,7 +441,7 @@ def try_mutations(
 
 
 def as_mapping(certificate: Certificate, results: Sequence[MutationResult]) -> dict[str, Any]:
-    """Return the results of the faults for JSON, beside the certificate's; empty without faults."""
+    """Return the results of the faults as JSON-serializable values; empty without faults."""
     rows: list[dict[str, Any]] = []
     for result in results:
         row: dict[str, Any] = {

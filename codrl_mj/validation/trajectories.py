@@ -1,8 +1,8 @@
 """Comparison of whole runs in MuJoCo with Gymnasium under the same commands.
 
-In MuJoCo the motor runs in the callback, beside Gymnasium in plain Python. A run is checked twice.
-Up to the horizon of `Task.reference_states` the difference itself must stay below 1e-9. Over a
-whole episode a chaotic task enlarges even the smallest rounding beyond any fixed bound. There the
+In MuJoCo the motor runs in the callback; for Gymnasium it runs in plain Python. A run is checked
+twice. Up to the horizon of `Task.reference_states` the difference itself must stay below 1e-9. Over
+a whole episode a chaotic task enlarges even the smallest rounding beyond any fixed bound. There the
 difference is divided by the growth of rounding errors in the oracle along the same run (`Growth`),
 which separates the port's error from its amplification by chaos.
 """
@@ -30,7 +30,8 @@ chaotic.
 ROUNDINGS = 30.0
 """Largest difference over a whole run, in standard deviations of the oracle's accumulated rounding.
 
-The rounding is 2e-16 for each entry and step; a step rounds some tens of numbers.
+The oracle is assumed to round each entry by 2e-16 in each step; a real step rounds some tens of
+numbers.
 """
 
 UNLIMITED_STEPS = 200
@@ -49,7 +50,7 @@ It is far above rounding, and small enough for the step to be linear in it.
 ROUNDING = float(np.finfo(float).eps)
 """Rounding error of a double, relative."""
 CLOCK = 2
-"""Number of entries behind the states in a snapshot of `AnalyticPhysics`: time and key."""
+"""Number of entries after the states in a snapshot of `AnalyticPhysics`: time and key."""
 
 
 class Growth:
