@@ -1,4 +1,4 @@
-"""Test of the exported C code in closed loop, compiled for the host or for an emulated board.
+"""Processor-in-the-loop test of the exported C code, on the host or on an emulated board.
 
 The C code is the controller of the simulation and communicates with it frame by frame.
 """

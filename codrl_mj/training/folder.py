@@ -137,7 +137,7 @@ def resume_command(run: Path) -> str:
     return command("train", "--resume", run, trust=needs_trust(run))
 
 
-def describe_remains(run: Path) -> str:
+def describe_resumption(run: Path) -> str:
     """Return a sentence on how to continue a training that was interrupted."""
     if existing := find_checkpoints(run / CHECKPOINTS):
         step = max(int(parts["step"]) for parts in existing.values())

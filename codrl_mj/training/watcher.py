@@ -155,11 +155,11 @@ class Watcher(BaseCallback):
         except OSError as error:
             raise OSError(
                 f"training in {self._out} was interrupted: {error}."
-                f" {folder.describe_remains(self._out)}"
+                f" {folder.describe_resumption(self._out)}"
             ) from error
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
-                f"stopped at once. {folder.describe_remains(self._out)}"
+                f"stopped at once. {folder.describe_resumption(self._out)}"
             ) from None
         except Exception:
             self._check_weights()

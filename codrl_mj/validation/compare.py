@@ -38,7 +38,7 @@ def differences(task: Task, ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
     return gap / np.maximum(1.0, np.abs(oracle))
 
 
-def is_ours(task: Task) -> bool:
+def is_built_in(task: Task) -> bool:
     """Return True if the task comes with this package."""
     return task.reward.__module__.startswith("codrl_mj.")
 

@@ -40,7 +40,7 @@ from codrl_mj.validation.compare import (
     NO_REFERENCE_ENV,
     Equations,
     gymnasium_equations,
-    is_ours,
+    is_built_in,
     named_actuators,
     paper_actuators,
     physics_classes,
@@ -232,7 +232,7 @@ def halving_range(task: Task, max_halvings: int = 4) -> range:
     # Without `Task.reference_states` the run is arbitrary and may be violent: it begins with finer
     # steps.
     first = 2 if task.reference_states is None else 0
-    return range(first, first + (1 if is_ours(task) else max_halvings + 1), 2)
+    return range(first, first + (1 if is_built_in(task) else max_halvings + 1), 2)
 
 
 def coarsest_passing(task: Task, evaluate: Callable[[int], Case], max_halvings: int = 4) -> Case:
@@ -251,7 +251,7 @@ def attribute_failure(
     task: Task, outcome: Check, evaluate: Callable[[int], tuple[float, str]], promised: float
 ) -> Check | Skipped:
     """Add the cause to a failed check of a custom task; skip it if textbook steps fail as well."""
-    if outcome.passed or is_ours(task):
+    if outcome.passed or is_built_in(task):
         return outcome
     distance, finding = min(map(evaluate, halving_range(task)))
     if distance <= ORDER_TOLERANCE:

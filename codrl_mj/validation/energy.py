@@ -38,7 +38,7 @@ from codrl_mj.user_code import asset_path
 from codrl_mj.validation.compare import (
     FALLBACK_ACTUATOR,
     gymnasium_equations,
-    is_ours,
+    is_built_in,
     named_actuators,
     physics_classes,
     scaled_forces,
@@ -415,7 +415,7 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     if reason:
         yield Skipped("the balances of a whole run", reason)
         return
-    unbalanced = "" if is_ours(task) else unbalanced_energy(task)
+    unbalanced = "" if is_built_in(task) else unbalanced_energy(task)
     for integrator in task.integrators:
         for outcome in balances(task, integrator, quick, unbalanced):
             yield (

@@ -28,7 +28,7 @@ from codrl_mj.physics import MujocoPhysics, compiled_task, mjcf
 from codrl_mj.physics.variation import bare_model
 from codrl_mj.tasks import PAPER_TASKS, find_task
 from codrl_mj.validation.certificate import (
-    WITHOUT_TASK,
+    TASK_INDEPENDENT,
     Certificate,
     Progress,
     ignore_progress,
@@ -432,7 +432,7 @@ def try_mutations(
             continue
         with mutation.apply(), _quiet():
             certificate = validate(affected, quick=True, groups=mutation.groups)
-        for task in ([""] if set(WITHOUT_TASK) & set(mutation.groups) else []) + affected:
+        for task in ([""] if set(TASK_INDEPENDENT) & set(mutation.groups) else []) + affected:
             checks = [check for check in certificate.checks if check.task == task]
             failed = tuple(check for check in checks if not check.passed)
             results.append(MutationResult(mutation.name, task, failed, len(checks)))

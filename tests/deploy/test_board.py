@@ -231,7 +231,8 @@ def test_raises_for_pwm_bits_without_a_loop_or_a_voltage(tmp_path):
         trained("pendulum", "ddpg")[0], EnvConfig("pendulum", "lag"), "ddpg", tmp_path / "out", 1
     )
     with pytest.raises(
-        ValueError, match="must be 0: the C code neither closes a current loop nor commands a voltage"
+        ValueError,
+        match="must be 0: the C code neither closes a current loop nor commands a voltage",
     ):
         board_test(tmp_path / "out", episodes=1, link=Link(pwm_bits=8))
 

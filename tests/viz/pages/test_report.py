@@ -151,7 +151,10 @@ def test_the_episode_is_the_median_one_or_has_its_rank(run):
     (episode,) = run_episodes(load_policy(run), load_config(run).evaluation_env.make, 1, 7)
     worse = sum(value < episode.total for value in (-900.0, -200.0, -1500.0, -300.0, -1000.0))
     assert "seed 7, return" in text
-    assert f"{worse} of 5 evaluated episodes had a lower return; the median is -900 (seed 1000000)" in text
+    assert (
+        f"{worse} of 5 evaluated episodes had a lower return; the median is -900 (seed 1000000)"
+        in text
+    )
     write_evaluation(run, [])
     text = report_page(run).text
     assert "seed 0, return" in text
