@@ -64,7 +64,7 @@ class Feasible:
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
-        """Print the bounds, and the verdict last."""
+        """Print the bounds, then the verdict."""
         from codrl_mj import sizing
         from codrl_mj.sizing import (
             demand_of,

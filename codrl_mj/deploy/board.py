@@ -98,7 +98,7 @@ class Link(Checked):
     damaged: float = real(0.0, minimum=0.0, maximum=1.0)
     """Share of the frames in which one bit flips."""
     late: float = real(0.0, minimum=0.0, maximum=1.0)
-    """Share of the answers that come one period late, so that the previous command still holds."""
+    """Share of the answers that come one period late, so that the previous command is held."""
     counts: int = integer(0, minimum=0)
     """Encoder counts per turn, to which angles are rounded; 0: exact.
 

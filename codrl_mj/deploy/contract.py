@@ -1,8 +1,8 @@
 """Contract between a policy and its controller, in the file `contract.json`.
 
-A policy on a board fails silently if an angle comes in degrees, two entries are swapped or the loop
-runs at another rate. The contract therefore records all assumptions, and its reader raises an error
-if one does not hold.
+A policy on a board fails silently if an angle is in degrees, two entries are swapped or the loop
+runs at another rate. The contract therefore records all assumptions of the policy, and its methods
+raise an error if one does not hold.
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""Monitoring and driving of a real board at a serial port, and the log of its answers."""
+"""Runs of a real board at a serial port, which only reports or also drives, and their logs."""
 
 import contextlib
 import csv

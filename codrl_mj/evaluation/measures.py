@@ -9,9 +9,9 @@ import numpy as np
 MIN_CORRELATION = 0.5
 """Smallest correlation for which a delay is returned; it explains a quarter of the variance."""
 EQUAL_CORRELATION = 0.99
-"""Share of the highest peak above which peaks count as equal.
+"""Share of the highest peak above which peaks count as equally high.
 
-A periodic signal has such a peak in each period; the first is the delay.
+A periodic signal has such a peak in each period; the first one is the delay.
 """
 
 

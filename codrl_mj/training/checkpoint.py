@@ -1,7 +1,7 @@
 """Checkpoints: files with the complete state of a training.
 
-They are written atomically, contain a digest of their content in their names, and contain no code.
-A state is everything that the rest of a training depends on: weights, optimizers, replay buffer,
+They are written atomically, have a digest of their content in their names, and contain no code. A
+state is everything on which the rest of a training depends: weights, optimizers, replay buffer,
 exploration noise, counters, environments and all random generators. Nothing is pickled. Rollout
 buffers are omitted, because states are captured between two rollouts, when they are empty.
 """

@@ -50,7 +50,7 @@ class Watcher(BaseCallback):
         on_progress: Callable[[Progress], None] | None,
         tensorboard: bool,
     ) -> None:
-        """Take the arguments of `train`, and the list of signals that stop the training."""
+        """Store the arguments of `train`, and the list of signals that stop the training."""
         super().__init__()
         self._config, self._out, self._stop_signals, self._on_progress = (
             config,
