@@ -310,7 +310,7 @@ def test_an_angle_command_has_no_tracking_measures():
     plots = {plot.title: plot for plot in _motor_plots(_motor_series(shown, list(episode.motors)))}
     for title, name in (
         ("Torque at the shaft", "desired"),
-        ("Error: desired less actual", "desired less actual"),
+        ("Error: desired minus actual", "desired minus actual"),
     ):
         assert [curve.label for curve in plots[title].curves if name in curve.label] == [
             f"joint1: {name}"
@@ -330,7 +330,7 @@ def test_an_angle_command_has_no_tracking_measures():
             [RunEpisode("run", current_only, episode, None, None, 3)], list(episode.motors)
         )
     )
-    assert "Error: desired less actual" not in [plot.title for plot in plots]
+    assert "Error: desired minus actual" not in [plot.title for plot in plots]
 
 
 def test_a_film_shows_the_voltage_of_every_family_with_one(monkeypatch):

@@ -368,7 +368,10 @@ def test_a_run_that_is_not_smooth_is_skipped_with_a_reason():
 def test_a_hill_without_a_reference_environment_skips_the_energy_checks():
     register_variation(TASKS["mountain_car"], reference_env=None, paper=())
     assert skipped_checks(["energy"]) == [
-        ("all checks", "the model has a hill, whose height only a reference environment tells")
+        (
+            "all checks",
+            "the model has a hill, whose height can only be read from a reference environment",
+        )
     ]
 
 

@@ -104,8 +104,8 @@ class DeepAgentConfig(AgentConfig):
 
     def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
         """See `AgentConfig.make_policy`."""
-        # A policy for evaluation needs no optimizer, and the construction of torch's first one
-        # imports a compiler, which takes almost two seconds.
+        # A policy for evaluation needs no optimizer. Constructing the first one makes torch import
+        # a compiler, which takes almost two seconds.
         arguments = {**self._policy_arguments(), "optimizer_class": lambda *_, **__: None}
         return self._policy_class()(observation_space, action_space, lambda _: 0.0, **arguments)
 

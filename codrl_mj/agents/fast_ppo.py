@@ -28,9 +28,11 @@ class ActionEvaluation(NamedTuple):
     entropy: torch.Tensor
     """Entropies of the distributions, shape (N, 1)."""
     backward: Callable[[torch.Tensor, float], tuple[torch.Tensor, torch.Tensor | None]]
-    """Function (gradient of a loss with respect to `log_prob`, shape (N, 1); that with respect to
-    each entry of `entropy`) -> its gradients with respect to the actor's outputs, shape (N, a), and
-    to `log_std`, or None.
+    """Function that propagates the gradient of a loss backward.
+
+    Its arguments are the gradient with respect to `log_prob`, shape (N, 1), and the gradient with
+    respect to each entry of `entropy`. It returns the gradients with respect to the actor's
+    outputs, shape (N, a), and to `log_std`, which is None for discrete actions.
     """
 
 
@@ -79,11 +81,11 @@ class Gaussian:
 
     The logarithms of the standard deviations are a parameter, shape (a,). With state-dependent
     noise its shape is (h, a), and the noise is a linear function of the h units of the actor's last
-    hidden layer; the function's factors are drawn every `sample_freq` steps.
+    hidden layer; its coefficients are drawn every `sample_freq` steps.
     """
 
     def __init__(self, policy: ActorCriticPolicy, sample_freq: int) -> None:
-        """Take `log_std` from the policy, and share it with the policy."""
+        """Store `log_std`, which is shared with the policy."""
         self.log_std, self.sample_freq = policy.log_std, sample_freq
         self._state_dependent = policy.use_sde
         # Stable-Baselines3 adds this to the variance of state-dependent noise.
@@ -91,7 +93,7 @@ class Gaussian:
         self._action_scale = getattr(policy, "largest", torch.ones(policy.log_std.shape[-1]))
 
     def draw_noise(self, steps: int, envs: int, outputs: int) -> torch.Tensor:
-        """Draw noise (steps, envs, a), or its factors (steps / sample_freq, envs, h, a)."""
+        """Draw noise (steps, envs, a), or its coefficients (steps / sample_freq, envs, h, a)."""
         del outputs
         return (
             torch.randn(-(-steps // self.sample_freq), envs, *self.log_std.shape)
@@ -137,13 +139,13 @@ class FastPPO(PPO):
     """Faster implementation of Stable-Baselines3's PPO.
 
     The policy, rollouts, losses and minibatches are the same. Only the order of floating-point
-    additions and the draws of noise differ. Each step of a rollout runs only the actor; the values
-    and probabilities of all its actions are computed together at its end. Gradients are explicit
-    formulas instead of automatic differentiation.
+    additions and the draws of noise differ. In a rollout only the actor runs; the values and the
+    probabilities of all actions are computed together at the end of the rollout. Gradients are
+    explicit formulas instead of automatic differentiation.
 
     Raises:
-        ValueError: observations of several parts, a clipped value loss, or a policy with parameters
-            outside its two networks, such as a features extractor that learns. Use
+        ValueError: the observations are a `Dict`, the value loss is clipped, or the policy has
+            parameters outside of its two networks, such as a features extractor that learns. Use
             Stable-Baselines3's `PPO` for these.
     """
 
@@ -229,7 +231,7 @@ class FastPPO(PPO):
         rollout_buffer.log_probs[:] = evaluation.log_prob.view(rollout_buffer.log_probs.shape)
         rollout_buffer.values[:] = layers[-1][1, :, 0].view(rollout_buffer.values.shape)
         if truncated:
-            # The task would have gone on, so the value of the last state is added to the reward.
+            # The task itself did not end, so the value of the last state is added to the reward.
             steps, rows, last = zip(*truncated, strict=True)
             rollout_buffer.rewards[list(steps), list(rows)] += (
                 self.gamma * self._values(np.array(last)).numpy()
@@ -254,7 +256,8 @@ class FastPPO(PPO):
             for name in _TRAINING_FIELDS
         ]
         for _ in range(self.n_epochs):
-            # numpy's global generator, which Stable-Baselines3 seeds and uses for its minibatches.
+            # The global generator of numpy is the one that Stable-Baselines3 seeds and uses for
+            # minibatches.
             order = torch.as_tensor(np.random.permutation(len(features)))
             shuffled = [values[order].split(self.batch_size) for values in (features, *rest)]
             is_within_limit = all(
@@ -286,9 +289,9 @@ class FastPPO(PPO):
         advantages: torch.Tensor,
         returns: torch.Tensor,
     ) -> bool:
-        """Take a gradient step on a minibatch; return True if it was taken.
+        """Take a gradient step on a minibatch; return False if no step was taken.
 
-        It is not taken if the policy has diverged too far from that of the rollout.
+        No step is taken if the policy has diverged too far from the policy of the rollout.
         """
         networks, size = self._networks, len(features)
         layers = networks.forward(features)

@@ -127,16 +127,16 @@ class TwoRatePPO(PPO):
     """Stable-Baselines3's PPO with separate passes and learning rates for actor and critic.
 
     This is the update of Spinning Up and of Keras's example: passes over the rollout improve the
-    actor until its divergence exceeds 1.5 times `target_kl`; the critic is fitted in any case.
-    Gradients are not clipped. One Adam optimizer has both networks, in two groups. Adam keeps
-    moments and counts for each tensor and skips tensors without a gradient, so it acts like two
-    optimizers with one state dict.
+    actor until its KL divergence exceeds 1.5 times `target_kl`; the critic is fitted in any case.
+    Gradients are not clipped. A single Adam optimizer has the two networks as parameter groups. It
+    keeps moments and step counts for each tensor and skips tensors without a gradient, so it acts
+    like two optimizers, but has one state dict.
     """
 
     def __init__(
         self, *args: Any, critic_learning_rate: float, critic_epochs: int, **kwargs: Any
     ) -> None:
-        """Take the arguments of `PPO`, and two of the critic.
+        """Take the arguments of `PPO`, and two for the critic.
 
         `learning_rate` is the actor's, and `n_epochs` the largest number of its passes.
         """
@@ -172,7 +172,7 @@ class TwoRatePPO(PPO):
     def _improve_actor(self) -> bool:
         """Improve the actor in one pass over the rollout; return True if the pass was completed.
 
-        It stops early if the policy has diverged too far from that of the rollout.
+        The pass stops early if the policy has diverged too far from the policy of the rollout.
         """
         clip_range = self.clip_range(self._current_progress_remaining)
         for rollout in self.rollout_buffer.get(self.batch_size):
@@ -182,7 +182,8 @@ class TwoRatePPO(PPO):
             log_probability = distribution.log_prob(actions)
             log_ratio = log_probability - rollout.old_log_prob
             ratio = log_ratio.exp()
-            # An unbiased estimate, with low variance, of the old policy's divergence from the new.
+            # An unbiased estimate, with low variance, of the KL divergence of the old policy from
+            # the new.
             divergence = (ratio - 1 - log_ratio).mean().item()
             self.logger.record("train/approx_kl", divergence)
             if self.target_kl is not None and divergence > 1.5 * self.target_kl:
@@ -219,7 +220,7 @@ class TwoRatePPO(PPO):
 
 
 class _CriticLearningRate:
-    """Mixin that gives the critic a separate learning rate."""
+    """Mixin for off-policy algorithms whose critic has a separate learning rate."""
 
     def __init__(self, *args: Any, critic_learning_rate: float, **kwargs: Any) -> None:
         """Take the arguments of the Stable-Baselines3 model, and the critic's learning rate.

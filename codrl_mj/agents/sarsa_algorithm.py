@@ -60,7 +60,7 @@ class Learner(NamedTuple):
     traces: Traces
     """Eligibility traces of the weights."""
     tiles: np.ndarray
-    """Indices of the active tiles, which contain the present observation, shape (n,)."""
+    """Indices of the active tiles, which contain the current observation, shape (n,)."""
     step_size: float
     """Step size of each weight."""
     gamma: float
@@ -257,8 +257,9 @@ class TileCodingPolicy(BasePolicy):
 class CompiledEpisodes:
     """Runner of whole episodes of an `ActuatedVecEnv` with one environment, in compiled code.
 
-    It has a separate simulation, with bit-identical results. After an episode the environment is in
-    the state to which its own steps would have led: at the start of the next episode.
+    The runner has its own simulation, whose results are bit-identical. After an episode it leaves
+    the environment in the state to which the environment's own steps would have led: at the start
+    of the next episode.
     """
 
     def __init__(self, env: ActuatedVecEnv) -> None:
@@ -275,8 +276,8 @@ class CompiledEpisodes:
     def can_run(env: Any) -> bool:
         """Return True if whole episodes of an environment can run in compiled code.
 
-        It must be a single one of our environments in MuJoCo, with one motor and a time limit, and
-        without randomization or changed attributes.
+        It must be a single `ActuatedVectorEnv` with one motor and a time limit, and without
+        randomization or changed attributes.
         """
         return (
             type(env) is ActuatedVecEnv
@@ -289,7 +290,7 @@ class CompiledEpisodes:
         )
 
     def run(self, learner: Learner, generator: np.random.Generator) -> tuple[Any, ...] | None:
-        """Learn from an episode; return None, without effect, if one has started already.
+        """Learn from an episode; return None, without effect, if one has already started.
 
         Returns:
             The arguments of `SARSA._count`: number of steps, first observation (1, k) of the next
@@ -300,7 +301,7 @@ class CompiledEpisodes:
         setup, snapshot = vector.setup, vector.snapshot()
         if snapshot["elapsed"][0] != 0:
             return None
-        # A reset installs MuJoCo's callbacks, which `restore` does not.
+        # `restore` alone would not install the MuJoCo callbacks.
         self._physics.reset(np.zeros(len(setup.task.state_names)))
         self._physics.restore(snapshot["physics"][0])
         self._physics.memory[:] = snapshot.get("disturbances", np.zeros((1, 0)))[0]
@@ -355,7 +356,7 @@ class SARSA(BaseAlgorithm):
         """
         self.config = config
         self._episodes: CompiledEpisodes | None = None
-        # The probability of a random action in the present episode.
+        # The probability of a random action in the current episode.
         self.exploration_rate = getattr(config, "epsilon", 0.0)
         if getattr(env, "num_envs", 1) != 1:
             raise ValueError(
@@ -371,7 +372,7 @@ class SARSA(BaseAlgorithm):
         self.set_random_seed(self.seed)
         # A loaded model has the saved generator.
         if "_generator" not in self.__dict__:
-            # The seed is a child of the given one. With the same seed, the generators of agent and
+            # A child seed is used, because with the same seed the generators of agent and
             # environment would draw the same numbers.
             self._generator = np.random.default_rng(np.random.SeedSequence(self.seed).spawn(1)[0])
         self.policy = self.policy_class(

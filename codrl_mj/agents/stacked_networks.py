@@ -1,10 +1,11 @@
-"""Actor and critic as one stack of networks with an explicit gradient.
+"""Actor and critic as one batch of two networks, with explicit gradients.
 
 The module imports torch, so import it only where an agent is created.
 
 With networks of 64 units most of a gradient step's time is overhead: modules, the graph of
-automatic differentiation, an optimizer that handles tensor by tensor. In this module a few batched
-products compute both networks, forwards and backwards, and all their parameters are one vector.
+automatic differentiation, an optimizer that handles tensor by tensor. This module computes both
+networks, forward and backward, by a few batched matrix products, and keeps all parameters in one
+vector.
 """
 
 from collections.abc import Iterable
@@ -21,7 +22,11 @@ _ACTIVATIONS: dict[type[nn.Module], tuple[Any, Any]] = {
         lambda gradient, output: torch.ops.aten.threshold_backward(gradient, output, 0.0),
     ),
 }
-"""Activation -> its function; and (gradient at the output, output) -> gradient at the input."""
+"""Activation -> its function, and its backward function.
+
+The latter maps the gradient with respect to the output, and the output, to the gradient with
+respect to the input.
+"""
 
 
 class StackedNetworks:
@@ -72,7 +77,7 @@ class StackedNetworks:
             sum(2 * outputs * (inputs + 1) for outputs, inputs in shapes) + noise
         )
         self.gradient = torch.zeros_like(self.parameters)
-        # For each layer (2, outputs, inputs) and (2, 1, outputs).
+        # The shapes for each layer are (2, outputs, inputs) and (2, 1, outputs).
         self.weights, self.biases = _carve(self.parameters, shapes)
         self._weight_gradients, self._bias_gradients = _carve(self.gradient, shapes)
         for tower, linears in enumerate(towers):
@@ -88,7 +93,7 @@ class StackedNetworks:
     def holds(self, policy: ActorCriticPolicy) -> bool:
         """Return True if the policy's parameters are views of `parameters`.
 
-        Those of a copied policy are not.
+        The parameters of a copied policy are not.
         """
         return policy.action_net.weight.data_ptr() == self.weights[-1].data_ptr()
 
@@ -113,7 +118,7 @@ class StackedNetworks:
         return layers
 
     def backward(self, layers: list[torch.Tensor], gradient: torch.Tensor) -> None:
-        """Compute `gradient`, except for that of `log_std`.
+        """Compute the attribute `gradient`, except for the part of `log_std`.
 
         Args:
             layers: result of `forward`.
@@ -127,9 +132,9 @@ class StackedNetworks:
 
 
 class VectorAdam(torch.optim.Adam):
-    """Adam on one vector; its state dict is that of an Adam on the parameters that are its views.
+    """Adam on one vector, with the state dict of an Adam on the parameters that are views of it.
 
-    Stable-Baselines3 can therefore load the saved models, and its own models can be loaded.
+    Saved models can therefore be exchanged with Stable-Baselines3 in both directions.
     """
 
     def __init__(self, vector: torch.Tensor, views: Iterable[nn.Parameter], **options: Any) -> None:

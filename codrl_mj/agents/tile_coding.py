@@ -1,8 +1,8 @@
-"""Tile coding: a point as the tiles that contain it, one in each of several displaced grids.
+"""Tile coding: a point is represented by the tiles that contain it, one in each displaced grid.
 
 Sutton and Barto, *Reinforcement Learning: An Introduction* (2018), section 9.5.4, with the
-displacements of Sutton's tiles3: along axis j (from 0), tiling t is displaced by (2 j + 1) t n-ths
-of a tile, where n is the number of tilings. There is no hashing: every tile has a separate index.
+displacements of Sutton's tiles3: along axis j (from 0), tiling t is displaced by (2 j + 1) t / n
+tiles, where n is the number of tilings. There is no hashing: every tile has a separate index.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Command line: parses the words, calls the package, prints the result. No module imports it."""
+"""Command line, which parses words, calls the package and prints results; no module imports it."""
 
 import contextlib
 import contextvars
@@ -28,7 +28,7 @@ from codrl_mj.runs.files import check_file, check_page, check_writable
 from codrl_mj.user_code import FILES_TRUSTED
 
 VERB_HELP: dict[str, tuple[str, str]] = {
-    # A verb, or the first word of a group of verbs: one sentence, and an example.
+    # Verb, or first word of a group of verbs -> one sentence, and an example.
     "train": ("Train an agent through an actuator.", "cartpole --actuator weaker"),
     "evaluate": ("Measure a policy on any actuator.", "runs/mine --actuator lag"),
     "runs": ("List the runs of a folder, or compare some.", "runs --sort return"),
@@ -117,7 +117,7 @@ def main(arguments: list[str] | None = None) -> int:
         Exit status: 0; 1 if a validation fails; 2 for bad input and all other errors; 130 after
             Ctrl-C; 141 if the reader of the output has closed it; 143 after SIGTERM.
     """
-    # While the package was imported, Ctrl-C ended the process with one line. From here on it raises
+    # During the import of the package Ctrl-C ends the process with one line. From here on it raises
     # KeyboardInterrupt, so that a training can write its checkpoint.
     if signal.getsignal(signal.SIGINT) is codrl_mj._exit_on_interrupt:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -153,8 +153,8 @@ def _run(arguments: list[str], traced: bool) -> int:
         _check_outputs(verb)
         return _run_verb(verb)
     except BrokenPipeError:
-        # The reader of the output, such as `head`, has closed it. Python flushes stdout at exit and
-        # would print an error, so the rest goes to /dev/null.
+        # The reader of the output, such as `head`, has closed the pipe. Python flushes stdout at
+        # exit and would print an error, so the rest goes to /dev/null.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except (Exception, KeyboardInterrupt) as error:
@@ -234,7 +234,7 @@ def _check_outputs(verb: Any) -> None:
 def _is_interrupt(error: BaseException | None) -> bool:
     """Return True if an error was caused by Ctrl-C.
 
-    Libraries that are being imported turn a KeyboardInterrupt into errors of their own.
+    A library that is being imported may turn a KeyboardInterrupt into an error of its own.
     """
     return error is not None and (
         isinstance(error, KeyboardInterrupt) or _is_interrupt(error.__context__)

@@ -75,7 +75,7 @@ class Advise:
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
-        """Print the severities, the known remedies, and the verdict last."""
+        """Print the severities and the known remedies, then the verdict."""
         from codrl_mj.study.advice import advise
         from codrl_mj.study.axes import REFERENCE_SPEEDS, study_env
         from codrl_mj.study.evidence import Evidence

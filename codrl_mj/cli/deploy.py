@@ -111,7 +111,7 @@ class Export:
         return 0
 
     def _environment(self: Any, subject: Subject) -> EnvConfig:
-        """Return the environment of the training: from the run folder, or for a zip from flags."""
+        """Return the environment of the training, from the run folder or, for a zip, from flags."""
         from codrl_mj.training.folder import load_config
 
         trained_env = (
@@ -228,7 +228,7 @@ class Test:
             ("frames and samples per second", f"{result.rate:.0f}"),
             ("instructions per policy step, per sample", instructions),
         ]
-        print_table(f"{self.folder} as C on {self.target}", ("", ""), rows)
+        print_table(f"{self.folder} as C code on {self.target}", ("", ""), rows)
         if self.log is not None:
             write_log(self.log, Contract.read(self.folder), result.on_board[0])
             print(f"wrote {self.log}; try: {command('board', 'check', self.folder, self.log)}")
@@ -240,7 +240,7 @@ class Test:
             ) as board_policy:
                 env = board_policy.rig
                 panel = record(board_policy, env, self.seed, 640, 480)
-            title = f"{env.task} with C code on {self.target}: return {panel.episode.total:.0f}"
+            title = f"{env.task}, C code on {self.target}: return {panel.episode.total:.0f}"
             film([dataclasses.replace(panel, title=title)], self.film, 640, 480)
             print(f"wrote {self.film}")
         return int(
@@ -395,8 +395,8 @@ class CompareLog:
             f" {len(comparison.starts)} windows"
         )
         rows = [
-            (name, unit or "?", f"{error:.3g}", f"{moved:.3g}")
-            for name, unit, error, moved in columns
+            (name, unit or "?", f"{error:.3g}", f"{baseline:.3g}")
+            for name, unit, error, baseline in columns
         ]
         heads = "", "unit", "error (RMS)", "if nothing changed"
         print_table(title, heads, rows, right=heads[2:])

@@ -97,7 +97,7 @@ Actuators = Annotated[
     ),
 ]
 FAMILY = "actuator.family"
-"""Flag that `scan_flags` reads besides `actuator`."""
+"""Name of the flag for the family of an actuator, for `scan_flags`."""
 _FAMILY_HELP = (
     "Another family for the same motor: `servo` turns a motor or a datasheet into a servo, which"
     " takes a position as its command."
@@ -118,7 +118,7 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
 
     Args:
         defaults: configuration with the default values.
-        chosen: the two flags, as `scan_flags` returns them.
+        chosen: the flags `--actuator` and `--actuator.family`, as `scan_flags` returns them.
         task: the environment's name.
     """
     source, all_names = defaults.source, (field.name for field in dataclasses.fields(EnvConfig))
@@ -206,9 +206,9 @@ def scan_flags(arguments: Sequence[str], *flag_names: str) -> argparse.Namespace
 
 
 def with_environment_flags(verb: Any, arguments: Sequence[str]) -> Any:
-    """Return a verb about a run with flags for environment and actuator.
+    """Return a verb with additional flags for environment and actuator.
 
-    Their defaults are those of the first run folder that the line names.
+    The defaults of the flags come from the first run folder that the command line names.
     """
     from codrl_mj.training.folder import load_config
 

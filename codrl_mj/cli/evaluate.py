@@ -140,7 +140,7 @@ def _print_measures(
         for name in columns
         if any(row.get(name) is not None for row in rows.values())
     }
-    heads = [head for head, _ in shown_columns.values()]
+    headers = [header for header, _ in shown_columns.values()]
     cells = [
         (
             label,
@@ -151,7 +151,7 @@ def _print_measures(
         )
         for label, row in rows.items()
     ]
-    print_table(title, (row_header, *heads), cells, right=heads, whole=heads)
+    print_table(title, (row_header, *headers), cells, right=headers, whole=headers)
 
 
 def _print_details(evaluations: Mapping[str, Evaluation]) -> None:

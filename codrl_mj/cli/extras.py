@@ -1,10 +1,10 @@
-"""Names of the extras that install a missing module."""
+"""Error message for a missing module, with the extras of this package that install it."""
 
 import importlib.metadata
 import re
 
 DISTRIBUTIONS = {"PIL": "pillow", "serial": "pyserial"}
-"""Modules whose distribution has another name."""
+"""Module -> its distribution, if the two have different names."""
 _NOT_FOR_USERS = {"bench", "dev", "docs"}
 
 
@@ -35,7 +35,7 @@ def missing_module_message(error: ModuleNotFoundError) -> str:
 
 
 def _extras_with(distribution: str) -> list[str]:
-    """Return the extras that require a distribution, without those that contain another of them."""
+    """Return the extras that require a distribution; skip those that include another of them."""
     try:
         requirements = importlib.metadata.requires("codrl-mj") or []
     # A checkout that was not installed has no metadata.

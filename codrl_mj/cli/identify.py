@@ -166,7 +166,7 @@ class Identify:
                 print_findings(log.name, shown_findings)
         if self.ignore_errors:
             return held_out
-        if fitted := [log.name for log in logs if any(log is finding for finding in bad_logs)]:
+        if fitted := [log.name for log in logs if any(log is bad_log for bad_log in bad_logs)]:
             raise ValueError(
                 f"logs {', '.join(fitted)} have errors that would make the fit wrong: see"
                 " codrl-mj identify check; correct the columns, leave the logs out, or pass"
@@ -177,7 +177,7 @@ class Identify:
                 f"warning: the held-out log {log.name} has errors and is left out",
                 style="yellow",
             )
-        return [log for log in held_out if not any(log is finding for finding in bad_logs)]
+        return [log for log in held_out if not any(log is bad_log for bad_log in bad_logs)]
 
 
 def print_identification(result: Any) -> None:
@@ -304,7 +304,7 @@ LOAD, SENSING, SAMPLER = (
     flag_dataclass(Sensing, Sensing()),
     flag_dataclass(Sampler, Sampler()),
 )
-"""Dataclasses of their flags."""
+"""Dataclasses of the flags for `Load`, `Sensing` and `Sampler`."""
 
 
 @dataclasses.dataclass(frozen=True)

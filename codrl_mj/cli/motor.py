@@ -47,7 +47,7 @@ class Changes:
     """Current limit of the drive [A]."""
 
     def drive(self, name: str) -> Any:
-        """Return the named drive with these values."""
+        """Return the named drive, changed to these values."""
         from codrl_mj.sizing import find_drive
 
         overrides: dict[str, Any] = dict(vars(self))

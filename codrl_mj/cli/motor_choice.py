@@ -67,7 +67,7 @@ class Feasible:
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
-        """Print the bounds, and the verdict last."""
+        """Print the bounds, then the verdict."""
         from codrl_mj import sizing
         from codrl_mj.sizing import (
             demand_of,
@@ -211,8 +211,8 @@ class Choose:
         settings = motors or None, self.voltage, self.margin, self.gears, self.max_current
         ranked = {name: choose(demand, *settings) for name, demand in demands.items()}
         only_demand = next(iter(demands.values())) if len(demands) == 1 else None
-        # MuJoCo multiplies the force of an actuator by its gear. The motor's arm radius divides by
-        # it, so that the motor acts on the joint as it does here.
+        # MuJoCo multiplies the force of an actuator by the actuator's gear. The motor's arm radius
+        # divides by this gear, so that the motor acts on the joint as it does in this ranking.
         if only_demand is not None and only_demand.model_gear != 1.0:
             text = (
                 f"gears act at the joint; the model's actuator has a gear of"
@@ -303,7 +303,7 @@ def _operation_mapping(operation: Any) -> dict[str, Any]:
 
 
 def _unknown_text(unknown: Sequence[str], judgment_text: str) -> str:
-    """Return a sentence on the numbers that a judgment omits, except those it names itself."""
+    """Return a sentence with the unknown numbers that the judgment's text does not mention."""
     omitted = ", ".join(name for name in unknown if name not in judgment_text)
     return f"unknown and not counted: {omitted}" if omitted else ""
 
@@ -343,7 +343,7 @@ def _own_share_text(drive: Any, operation: Any) -> str:
 def _print_ranking(
     choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], title: str
 ) -> None:
-    """Print a row for each choice; for several motors with the name of each."""
+    """Print a row for each choice; with several motors, the first column is the driven motor."""
     columns: tuple[str, ...]
     columns = (
         "motor",

@@ -1,4 +1,4 @@
-"""Parsing of a command line into a verb: custom modules, numbers, one-sentence error messages."""
+"""Parsing of a command line into a verb, with error messages of one sentence."""
 
 import contextlib
 import dataclasses
@@ -63,7 +63,7 @@ def parse_named_numbers(flag: str, texts: Sequence[str], example: str) -> dict[s
 
 
 def parse(kind: Any, program: str, words: Sequence[str], description: str | None = None) -> Any:
-    """Parse words into an instance of a verb's dataclass; SystemExit after the help is printed.
+    """Parse words into an instance of a verb's dataclass; a help flag raises SystemExit.
 
     A mapping of verbs to descriptions is parsed only to print its help.
     """

@@ -87,7 +87,7 @@ class Render(EpisodeVerb):
         episode = panel.episode
         title = f"{title}: return {episode.total:.0f}"
         if self.motor is not None and self.motor not in episode.motors:
-            choices = ", ".join(episode.motors) or "a single one without a name"
+            choices = ", ".join(episode.motors) or "not named: there is only one"
             hint = did_you_mean(self.motor, episode.motors)
             raise ValueError(f"--motor {self.motor}: {hint}the motors are {choices}")
         strip = 0 if self.motor is None else episode.motors.index(self.motor)

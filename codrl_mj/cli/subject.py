@@ -29,7 +29,7 @@ class Subject:
     """Run folder of the training; None if there is none."""
 
     def check_interface(self, env: EnvConfig) -> None:
-        """Raise ValueError if the policy has other observations or commands in an environment."""
+        """Raise ValueError if an environment has other observations or commands than the policy."""
         if self.run is None:
             from codrl_mj.runs.policies import check_spaces
 
@@ -94,7 +94,7 @@ class Source:
     ] = False
 
     def load(self, path: Path) -> Subject:
-        """Load the policy of a run folder, of a folder with only a policy, or of a zip of SB3."""
+        """Load the policy of a run folder, of a policy folder, or of a Stable-Baselines3 zip."""
         from codrl_mj.runs.policies import load_policy, load_sb3_zip
         from codrl_mj.training.folder import BEST, load_config, resume_command
 
@@ -143,7 +143,7 @@ class Source:
 def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig, str]:
     """Return the policy, the environment and a title, from a verb's `subject` and flags.
 
-    A task or an environment's id as subject gets random actions.
+    If the subject is a task or the id of an environment, the policy is random.
     """
     if not (is_random := is_source_name(verb.subject)) and not Path(verb.subject).exists():
         hint = did_you_mean(verb.subject, TASKS)

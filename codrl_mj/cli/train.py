@@ -286,7 +286,7 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
 
 
 def _base_config(chosen: argparse.Namespace) -> TrainConfig:
-    """Return the configuration whose values are the defaults of the flags."""
+    """Return the configuration that gives the flags their defaults."""
     if chosen.resume is not None and chosen.config is None:
         stored = load_config(Path(chosen.resume), chosen.trust)
         if chosen.settings is not None or chosen.agent not in (None, stored.agent.registry_name()):

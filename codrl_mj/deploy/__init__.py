@@ -1,4 +1,4 @@
-"""Export of a trained policy as ONNX and C, with a contract of all that it assumes."""
+"""Export of a trained policy as ONNX and C, with a contract that records its assumptions."""
 
 from codrl_mj.deploy.board import Board, BoardTest, Link, OnnxPolicy, board_test, instructions
 from codrl_mj.deploy.c_code import c_files

@@ -1,6 +1,6 @@
-"""Hardware-in-the-loop test of the exported C, compiled for the host or for an emulated board.
+"""Processor-in-the-loop test of the exported C code, on the host or on an emulated board.
 
-The C is the controller of the simulation and communicates with it frame by frame.
+The C code is the controller of the simulation and communicates with it frame by frame.
 """
 
 import contextlib
@@ -43,7 +43,7 @@ _TICK = 40
 
 
 def missing_tools(target: str) -> str:
-    """Return the command that installs the missing tools of a target, or "".
+    """Return the command that installs a target's missing tools; "" if none is missing.
 
     Raises:
         ValueError: the target is unknown.
@@ -56,7 +56,7 @@ def missing_tools(target: str) -> str:
 class OnnxPolicy:
     """The ONNX policy of an exported folder, with the safe command beyond the contract's limits.
 
-    It has the interface of other policies and is computed by onnxruntime.
+    It has the interface of the other policies; onnxruntime computes it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -73,7 +73,7 @@ class OnnxPolicy:
         self,
         observation: np.ndarray,
         *,
-        deterministic: bool = True,  # noqa: ARG002 - the protocol's
+        deterministic: bool = True,  # noqa: ARG002 - required by the Policy protocol
     ) -> tuple[np.ndarray, Any]:
         """Return actions (N, m) or (N,) for observations (N, k)."""
         actions = self.session.run(None, {"observation": observation.astype(np.float32)})[0]
@@ -98,7 +98,7 @@ class Link(Checked):
     damaged: float = real(0.0, minimum=0.0, maximum=1.0)
     """Share of the frames in which one bit flips."""
     late: float = real(0.0, minimum=0.0, maximum=1.0)
-    """Share of the answers that come one period late, so that the previous command still holds."""
+    """Share of the answers that come one period late, so that the previous command is held."""
     counts: int = integer(0, minimum=0)
     """Encoder counts per turn, to which angles are rounded; 0: exact.
 
@@ -129,11 +129,11 @@ class Link(Checked):
 
 
 class Board(contextlib.AbstractContextManager["Board"]):
-    """A policy that the exported C computes in a separate process, frame by frame in lockstep.
+    """A policy that the exported C code computes in a separate process, frame by frame.
 
-    It is a context manager, at whose end the process is terminated. If an answer is missing, the
-    contract's safe command is used. If the C closes the current loop, motors in this Python process
-    request the voltage of each sample of their loop from a second process of the same C.
+    As a context manager it terminates the process at the end. If an answer is missing, the
+    contract's safe command is used. If the C code also closes the current loop, the simulated
+    motors request the voltage of each sample from a second process that runs the same code.
     """
 
     def __init__(
@@ -146,27 +146,28 @@ class Board(contextlib.AbstractContextManager["Board"]):
         actuator: Any = None,
         trust: bool = False,
     ) -> None:
-        """Compile and start the C.
+        """Compile and start the C code.
 
         Args:
             folder: a folder that `codrl_mj.deploy.export` wrote.
             target: `host`, or `cortex-m4f`, which QEMU emulates.
             link: imperfections of the connection; None for none.
             seed: seed of lost, damaged and late frames.
-            loop: True if the C also closes the current loop, if it has one; False if the simulation
-                does.
+            loop: True if the C code also closes the current loop, if it has one; False if the
+                simulation closes it.
             actuator: motors of the simulation, by name, file or object; None: those of the
                 training.
             trust: True to import the modules that the contract names as task or actuator, which
-                executes them.
+                executes their code.
 
         Raises:
-            FileNotFoundError: the folder has no contract or no C.
+            FileNotFoundError: the folder has no contract or no C code.
             ValueError: the target or actuator is unknown, the actuator is of another family than
-                the C's loop, the contract names a module and `trust` is false, or bits are set
-                although the C neither closes a loop nor commands a voltage, or has no limit that
-                gives their range.
-            RuntimeError: a tool is missing (the message installs it), or the C does not compile.
+                the loop in the C code, the contract names a module and `trust` is false, or
+                `current_bits` or `pwm_bits` are set although the C code neither closes a loop nor
+                commands a voltage, or has no limit that gives their range.
+            RuntimeError: a tool is missing (the message says how to install it), or the C code does
+                not compile.
         """
         if install := missing_tools(target):
             raise RuntimeError(f"target {target}: its tools are missing: {install}")
@@ -187,10 +188,10 @@ class Board(contextlib.AbstractContextManager["Board"]):
         if self.loop is not None and type(motor) is not trained:
             raise ValueError(
                 f"actuator: a {type(motor).__name__}, must be a {trained.__name__}, for which the C"
-                " closes the loop; or let the simulation close it (--no-loop)"
+                " code closes the loop; or let the simulation close it (--no-loop)"
             )
-        # The drive's current limit applies in the C, with the motor of the training. A different
-        # motor in the simulation must therefore have no limit.
+        # The C code applies the drive's current limit, computed for the motor of the training. A
+        # different motor in the simulation must therefore have no limit.
         self.rig = self.env
         if self.loop is not None and actuator is not None and self.loop["kind"] == "sampled":
             unlimited = motor.replaced({"controller.max_current": np.inf})
@@ -203,7 +204,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
             self._wire = Wire(self.contract, process.stdin.fileno(), process.stdout.fileno())
             self._samples = np.zeros(2)
             if self.loop is not None:
-                # The import compiles with numba and is only needed for a loop in the C.
+                # The import compiles with numba and is only needed if the C code closes the loop.
                 from codrl_mj.deploy.on_board import loop_on_board
 
                 amperes = (
@@ -239,7 +240,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
         """
         finished: list[Episode] = []
         for index in range(count):
-            # A late answer must not apply a command of the episode before.
+            # A late answer must not apply a command of the previous episode.
             self._last = self._safe
             finished += run_episodes(self, self.rig.make, 1, seed + index)
             on_episode(len(finished))
@@ -249,7 +250,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
         self,
         observation: np.ndarray,
         *,
-        deterministic: bool = True,  # noqa: ARG002 - the protocol's
+        deterministic: bool = True,  # noqa: ARG002 - required by the Policy protocol
     ) -> tuple[np.ndarray, Any]:
         """Return actions (N, m) or (N,) for observations (N, k), each sent in a separate frame."""
         if self._samples[1]:
@@ -257,7 +258,10 @@ class Board(contextlib.AbstractContextManager["Board"]):
         return self.contract.to_actions(np.array([self.command(row) for row in observation])), None
 
     def command(self, observation: np.ndarray) -> np.ndarray:
-        """Return the command for an observation in the contract's units, safe without an answer."""
+        """Return the command for an observation, in the contract's units.
+
+        Without an answer it is the safe command.
+        """
         self.frames += 1
         observation = self.link.quantize(self.contract, observation)
         frame = bytearray(
@@ -286,7 +290,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
         return command
 
     def _converters(self) -> tuple[float, float]:
-        """Return the resolutions of current [A] and voltage [V] of a loop that the C closes."""
+        """Return the resolutions of current [A] and voltage [V] if the C code closes the loop."""
         bits = self.link.current_bits, self.link.pwm_bits
         if not any(bits):
             return 0.0, 0.0
@@ -312,10 +316,11 @@ class Board(contextlib.AbstractContextManager["Board"]):
             "the simulation closes the current loop: leave --no-loop out": (
                 self.contract.controller["loop"] is not None
             ),
-            "the C neither closes a current loop nor commands a voltage": (
+            "the C code neither closes a current loop nor commands a voltage": (
                 self.env.action != "voltage"
             ),
-            "the policy commands voltages, and the C measures no current": link.current_bits > 0,
+            "the policy commands voltages, and the C code measures no current": link.current_bits
+            > 0,
             "the motors differ": any(actuator != motor for actuator in self.env.actuators),
             "the environment has a disturbances.command_quantum already": (
                 disturbances.command_quantum > 0.0
@@ -337,7 +342,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
 
 @dataclasses.dataclass(frozen=True)
 class BoardTest:
-    """Results of an exported controller on a board and of onnxruntime, from the same seeds."""
+    """Results of an exported controller on a board, and of its ONNX model from the same seeds."""
 
     on_board: list[Episode]
     """Episodes with the board as the controller."""
@@ -386,7 +391,7 @@ def board_test(
     on_episode: Callable[[int], None] = lambda _: None,
     trust: bool = False,
 ) -> BoardTest:
-    """Run episodes with the exported C as the controller, and with the exported ONNX model.
+    """Run episodes with the exported C code as the controller, and with the exported ONNX model.
 
     Args:
         folder: a folder that `codrl_mj.deploy.export` wrote.
@@ -394,15 +399,16 @@ def board_test(
         episodes: number of episodes, each with a different seed.
         seed: seed of the first episode.
         link: imperfections of the connection; None for none.
-        loop: True if the C also closes the current loop, if it has one.
+        loop: True if the C code also closes the current loop, if it has one.
         actuator: as for `Board`.
         on_episode: callback with the number of episodes finished on the board.
         trust: as for `Board`.
 
     Raises:
-        FileNotFoundError: the folder has no contract or no C.
+        FileNotFoundError: the folder has no contract or no C code.
         ValueError: an argument is out of bounds.
-        RuntimeError: a tool is missing (the message installs it), or the C does not compile.
+        RuntimeError: a tool is missing (the message says how to install it), or the C code does not
+            compile.
     """
     with Board(folder, target, link, seed, loop, actuator, trust) as board:
         env = board.env
@@ -422,8 +428,9 @@ def instructions(folder: Path) -> tuple[int, int]:
     The maximum is over the golden observations; the processor is emulated.
 
     Raises:
-        FileNotFoundError: the folder has no contract or no C.
-        RuntimeError: a tool is missing (the message installs it), or the C does not compile.
+        FileNotFoundError: the folder has no contract or no C code.
+        RuntimeError: a tool is missing (the message says how to install it), or the C code does not
+            compile.
     """
     contract = Contract.read(folder)
     rows = np.array(
@@ -483,7 +490,7 @@ def _build(folder: Path, target: str, build_folder: Path, flags: list[str]) -> l
             (line for line in lines if "error:" in line or "undefined" in line),
             compiled.stderr.strip(),
         )
-        raise RuntimeError(f"{folder}: its C does not compile: {error}")
+        raise RuntimeError(f"{folder}: its C code does not compile: {error}")
     return (
         [program]
         if target == "host"

@@ -1,4 +1,4 @@
-"""C99 code of a policy and of the current loop behind it, for a microcontroller.
+"""C99 code of a policy and of the current loop that it commands, for a microcontroller.
 
 The code allocates no memory and uses only tanh, atan2 and fabs of the C library.
 """
@@ -31,12 +31,12 @@ CODE_BYTES = 6_000
 
 
 def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
-    """Return the C files of a policy and of the current loop behind it.
+    """Return the C files of a policy and of the current loop that it commands.
 
     Args:
         network: the policy.
-        contract: its contract, with the golden values, the parameters of the loop and the type of
-            the C's numbers.
+        contract: its contract, with the golden values, the parameters of the loop and the number
+            type of the C code.
 
     Returns:
         Name -> content of each of `FILES`.
@@ -53,16 +53,16 @@ def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
         text = repr(float(value)) if double else f"{float(np.float32(value)):.9g}"
         return (text if set(text) & set(".en") else f"{text}.0") + suffix
 
-    def array(values: Any, form: Callable[[float], str] = number) -> str:
-        return "{" + ", ".join(form(value) for value in np.ravel(values).tolist()) + "}"
+    def array(values: Any, format_value: Callable[[float], str] = number) -> str:
+        return "{" + ", ".join(format_value(value) for value in np.ravel(values).tolist()) + "}"
 
     golden = contract.golden
     levels = contract.levels
-    # The discrete actions of a third-party environment have no known values; the command is the
+    # The values of a third-party environment's discrete actions are unknown; the command is the
     # index.
     if network.low is None and levels is None:
         levels = np.arange(network.choices, dtype=np.float64)[:, None]
-    known = {
+    context = {
         "version": codrl_mj.__version__,
         "real": contract.controller["real"],
         "number": number,
@@ -103,7 +103,7 @@ def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
         undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False
     )
     return {
-        name: templates.from_string(asset_path(f"deploy/{name}.jinja").read_text()).render(known)
+        name: templates.from_string(asset_path(f"deploy/{name}.jinja").read_text()).render(context)
         for name in FILES
     }
 

@@ -12,8 +12,9 @@ from codrl_mj.deploy.log import read_rows
 from codrl_mj.envs.config import EnvConfig
 
 WINDOW, MIN_ROWS = 0.5, 10
-"""Default length of a window [s], after which the simulation restarts at the observed state, and
-the smallest number of its rows.
+"""Default duration [s] and smallest number of rows of a window.
+
+After each window the simulation restarts at the observed state.
 """
 _STARTS = 8
 """Number of further initial guesses in the search for the state of an observation."""
@@ -43,7 +44,7 @@ class RigComparison:
 
     @property
     def baseline_errors(self) -> np.ndarray:
-        """Errors of the prediction that nothing changes within a window, shape (k,); a baseline."""
+        """Errors of a baseline that holds the first observation of each window, shape (k,)."""
         held = self.logged[
             self.starts[np.searchsorted(self.starts, np.arange(len(self.time)), "right") - 1]
         ]
@@ -56,9 +57,10 @@ def compare(
     """Simulate the commands of a log and compare the observations with those in the log.
 
     The simulation starts at the state of the first row's observation and restarts after each
-    window; only the motors keep their states across windows. Randomization is off. A different
-    motor gets the current that the command meant in the training, as on the rig, where the
-    controller uses the training's torque constant.
+    window; only the motors keep their states across windows. Randomization is off. If
+    `actuator` is another motor, a force command gives it the same current as the motor of the
+    training. This is what happens on the rig, whose controller converts forces to currents with the
+    training's torque constant.
 
     Args:
         env: the environment of the training.
@@ -69,7 +71,7 @@ def compare(
     Raises:
         FileNotFoundError: there is no such log.
         ValueError: the log cannot be read, or belongs to another environment; `window` is shorter
-            than two rows; or the environment's state does not follow from its observation.
+            than two rows; or the environment's state cannot be determined from its observation.
     """
     env = dataclasses.replace(env, randomize=None)
     interface = Interface.from_env(env)
@@ -90,8 +92,8 @@ def compare(
         else dataclasses.replace(env, actuator=dict.fromkeys(env.actuators_by_name, actuator))
     )
     if env.action == "force" and interface.levels is None:
-        # Force at the joint for one ampere. An actuator without a motor gets 0 and its commands are
-        # not changed.
+        # Force at the joint for one ampere; 0 for an actuator without a motor, whose commands are
+        # not converted.
         constants = [
             [
                 motor.motor.torque_constant / motor.arm_radius if hasattr(motor, "motor") else 0.0
@@ -102,7 +104,7 @@ def compare(
         commands = commands * [
             new / old if new and old else 1.0 for new, old in zip(*constants, strict=True)
         ]
-        # An unknown bound is None, which becomes NaN here: no comparison with it is true.
+        # An unknown bound, None, becomes NaN, so that no command is beyond it.
         largest = np.array([entry["most"] for entry in interface.actions], dtype=float)
         if num_beyond := int((np.abs(commands) > largest * (1.0 + 1e-6)).any(axis=1).sum()):
             raise ValueError(
@@ -130,7 +132,7 @@ def compare(
 
 
 def _state_of(task: Any, observed: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return the task's state with an observation; of several states the one closest to `near`."""
+    """Return the task's state that gives an observation; the search starts at the state `near`."""
     from scipy.optimize import least_squares
 
     # The observations of the motors follow the task's and are left out.
@@ -149,7 +151,7 @@ def _state_of(task: Any, observed: np.ndarray, near: np.ndarray) -> np.ndarray:
     # A rank below the number of states means that some state does not affect the observation.
     if np.linalg.matrix_rank(fit.jac, tol=1e-6) < len(near):
         raise ValueError(
-            f"{task.name}: its state does not follow from its observation: the rig cannot be"
+            f"{task.name}: its state cannot be determined from its observation: the rig cannot be"
             " simulated"
         )
     return np.asarray(fit.x)

@@ -1,8 +1,8 @@
 """Contract between a policy and its controller, in the file `contract.json`.
 
-A policy on a board fails silently if an angle comes in degrees, two entries are swapped or the loop
-runs at another rate. The contract therefore records all assumptions, and its reader raises an error
-if one does not hold.
+A policy on a board fails silently if an angle is in degrees, two entries are swapped or the loop
+runs at another rate. The contract therefore records all assumptions of the policy, and its methods
+raise an error if one does not hold.
 """
 
 import contextlib
@@ -41,8 +41,8 @@ _PACKAGES = ("codrl-mj", "mujoco", "gymnasium", "numpy", "stable-baselines3", "t
 def _step_duration(env: Any) -> float:
     """Return the simulated time between two actions [s].
 
-    A task's environment knows it. For others it is measured, because their `dt` does not include
-    wrappers, such as one that repeats actions.
+    A task's environment stores the duration. For other environments it is measured, because their
+    `dt` does not include wrappers, such as one that repeats actions.
     """
     recorder, actions, durations = (
         env.get_wrapper_attr("recorder"),
@@ -77,10 +77,11 @@ class Interface:
     rate: float
     """Actions per second [Hz]."""
     observations: list[dict[str, Any]]
-    """Entries of an observation in their order: `name`, `unit`, bounds `least` and `most`.
+    """Entries of an observation, in order: `name`, `unit` and the bounds `least` and `most`.
 
-    A contract also has `scale` and `offset` before the first layer, which the policy applies
-    itself, and `seen`, the smallest and the largest value in the golden episodes.
+    In a contract, each entry also has `scale` and `offset`, by which the policy itself transforms
+    the entry before its first layer, and `seen`, the smallest and the largest value in the golden
+    episodes.
     """
     actions: list[dict[str, Any]]
     """Entries of an action in the same form; a discrete action has the `levels` of its indices."""
@@ -94,7 +95,10 @@ class Interface:
 
     @property
     def levels(self) -> np.ndarray | None:
-        """Commands of discrete actions, (choices, m) in the units of `actions`; None if unknown."""
+        """Commands of discrete actions, shape (choices, m), in the units of `actions`.
+
+        None if the actions are continuous, or if the commands are unknown.
+        """
         levels = [entry["levels"] for entry in self.actions if "levels" in entry]
         return np.array(levels, dtype=np.float64).T if levels else None
 
@@ -164,11 +168,11 @@ class Contract(Interface):
     agent: str
     """Name of the trained agent."""
     actuators: dict[str, dict[str, Any]]
-    """Motor or pattern of motors -> its `fields`, None for an ideal one, and their `sha256`."""
+    """Motor name or pattern -> `fields` of the actuator (None if ideal) and their `sha256`."""
     assumed: dict[str, Any]
-    """Environment for `EnvConfig.from_mapping`, with command, delays, quanta and joints."""
+    """Environment of the training, as a mapping for `EnvConfig.from_mapping`."""
     controller: dict[str, Any]
-    """Type of the C's numbers, `real`, and parameters of the `loop` behind the policy or None."""
+    """Number type of the C code, `real`, and the parameters of the current `loop`, or None."""
     limits: dict[str, list[float | None]]
     """Observation -> smallest and largest safe value; beyond them the safe command is used."""
     late: dict[str, Any]
@@ -198,9 +202,9 @@ class Contract(Interface):
             episodes: number of whole episodes for the golden values; the same number is added while
                 they have too few observations.
             seed: seed of the first episode.
-            limits: observation -> largest safe size, in its unit. An angle that is observed as
+            limits: observation -> largest safe magnitude, in its unit. An angle that is observed as
                 `cos_NAME` and `sin_NAME` is called NAME and must be below pi.
-            double: True if the C computes in double, False for float.
+            double: True if the C code computes in double, False for float.
 
         Raises:
             ValueError: the policy cannot be exported, `episodes` is below 1, or a limit is unknown
@@ -297,7 +301,7 @@ class Contract(Interface):
         """Raise an error if actuators are not those of the training.
 
         Args:
-            actuators: motor or pattern of motors -> `ActuatorModel`.
+            actuators: motor name or pattern -> `ActuatorModel`.
 
         Raises:
             ValueError: an actuator differs; the message names the first field that does.
@@ -318,7 +322,12 @@ class Contract(Interface):
 
 
 def _limits(names: list[str], limits: Mapping[str, float]) -> dict[str, list[float | None]]:
-    """Return the smallest and largest safe values, from the largest size of values or angles."""
+    """Return the smallest and largest safe value of each limited observation.
+
+    Args:
+        names: names of all observations.
+        limits: observation or angle -> its largest safe magnitude.
+    """
     angles = [name.removeprefix("cos_") for name in names if name.startswith("cos_")]
     check_names(limits, [*names, *angles], "limit")
     for name, largest in limits.items():
@@ -327,7 +336,8 @@ def _limits(names: list[str], limits: Mapping[str, float]) -> dict[str, list[flo
                 f"limit {name} = {largest:g}: must be > 0{' and < pi' if name in angles else ''},"
                 " and finite"
             )
-    # An angle is at most a limit below pi exactly if its cosine is at least the limit's cosine.
+    # For a limit below pi, an angle is within +-limit if and only if its cosine is at least the
+    # limit's cosine.
     return {
         f"cos_{name}" if name in angles else name: (
             [float(np.cos(largest)), None] if name in angles else [-largest, largest]

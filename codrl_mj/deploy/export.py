@@ -98,8 +98,8 @@ def export(
     """Write `policy.onnx`, `contract.json` and C99 code into a new folder atomically.
 
     The C code is `controller.h`, `controller.c` and `main.c`, which recomputes the golden commands.
-    It includes the loops if all motors have the same `codrl_mj.actuators.Drive`, `Servo` or paper's
-    `DCMotorActuator`.
+    It includes the current loop, and a servo's outer loops, if all motors have the same actuator
+    and that is a `codrl_mj.actuators.Drive`, a `Servo` or the paper's `DCMotorActuator`.
 
     Args:
         policy: as `codrl_mj.runs.policies.load_policy` returns it, of PPO, SAC, TD3, DDPG, DQN or
@@ -109,7 +109,7 @@ def export(
         out: the folder; it must not exist, or be empty.
         episodes: number of episodes for the golden values.
         seed: seed of the first episode.
-        double: True if the C computes in double, False for float.
+        double: True if the C code computes in double, False for float.
         board: board that the policy must fit, of `codrl_mj.deploy.c_code.BOARDS`; None for any.
         limits: as for `Contract.from_policy`.
 
@@ -139,7 +139,8 @@ def export(
     if (max_error := np.abs(actions - np.array(golden["actions"])).max()) > golden["tolerance"]:
         raise ValueError(
             f"the exported policy's actions differ by {max_error:.3g} from the original's, must be"
-            f" at most {golden['tolerance']:g}: its class computes something else"
+            f" at most {golden['tolerance']:g}: its class has operations that"
+            " are not exported"
         )
     with atomic_folder(out) as folder:
         (folder / ONNX).write_bytes(onnx_model(network, metadata).SerializeToString())

@@ -21,9 +21,9 @@ class LogCheck:
     rate: float
     """Median rate of the rows [Hz]."""
     late: int
-    """Number of rows that came later after the previous row than the contract allows."""
+    """Number of rows that came too long after the previous row, according to the contract."""
     outside: dict[str, int]
-    """Observation -> number of rows outside of the golden range by more than a tenth of it."""
+    """Observation -> number of rows beyond the golden range by more than a tenth of its width."""
     differing: int
     """Number of rows whose command differs from the policy's by more than the tolerance."""
     worst: float
@@ -89,7 +89,7 @@ def _measured(contract: Contract, episode: Episode) -> np.ndarray:
     angles = angles[episode.inner_steps - 1 :: episode.inner_steps] / [
         actuator.arm_radius for actuator in episode.actuators
     ]
-    # Episodes record values at the end of a step; a row has those at its beginning.
+    # An episode has the values at the end of each step, a log those at its beginning.
     at_end = [
         np.reshape(values, (steps, count))
         for values in (episode.signals["voltage"], episode.signals["current"], angles)
@@ -116,7 +116,7 @@ def read_rows(interface: Interface, path: Path) -> tuple[np.ndarray, np.ndarray,
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the table cannot be read, or its observations are not those of the policy:
-            permuted, missing, unknown, in another unit, or at another rate.
+            they are permuted, missing, unknown, in another unit, or at another rate.
     """
     # "utf-8-sig" skips the byte order mark that spreadsheet programs write.
     with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
@@ -205,7 +205,7 @@ def check_log(folder: Path, path: Path) -> LogCheck:
     time, observed, commands = read_rows(contract, path)
     steps = np.diff(time)
     expected = contract.to_commands(OnnxPolicy(folder).predict(observed)[0])
-    # Beyond a limit the C gives the safe command.
+    # Beyond a limit the C code gives the safe command.
     expected[~contract.is_within_limits(observed)] = contract.late["command"]
     errors = np.abs(commands - expected).max(axis=1)
     low, high = np.array([entry["seen"] for entry in contract.observations]).T

@@ -1,6 +1,6 @@
-"""Parameters of the loops behind a policy, for a controller that closes them.
+"""Parameters of the control loops that a policy commands, for the board that closes them.
 
-They are the loops of the drive, the servo and the paper's actuator.
+The loops are the current loops of a drive and of the paper's actuator, and the loops of a servo.
 """
 
 import contextlib
@@ -16,9 +16,9 @@ from codrl_mj.envs.config import EnvConfig
 def loop_parameters(env: EnvConfig) -> dict[str, Any] | None:
     """Return the parameters of the loop that all motors share; None if a board cannot close it.
 
-    The actuators must be a `codrl_mj.actuators.Drive`, whose gains are computed in the same way, at
-    25 degC; a `Servo`; or the paper's `DCMotorActuator`. The parameters are the current for a
-    command, limits [A] and [V], gains, and the sample rate [Hz].
+    The actuators must be a `codrl_mj.actuators.Drive`, a `Servo`, or the paper's `DCMotorActuator`.
+    Gains that are designed from the winding are those at 25 degC. The parameters are the current
+    for a command of 1, limits [A] and [V], gains, and the sample rate [Hz].
     """
     first: Any = env.actuators[0]
     actions = ("position", "velocity") if type(first) is Servo else ("force", "current")
@@ -71,7 +71,10 @@ def loop_parameters(env: EnvConfig) -> dict[str, Any] | None:
 
 
 def _paper_loop(actuator: DCMotorActuator, period: float) -> dict[str, Any]:
-    """Return the parameters of `actuators.electrical_step` at a period [s]; None: no limit."""
+    """Return the parameters of `actuators.electrical_step` at a period [s].
+
+    A limit of None means that there is no limit.
+    """
     loop, supply = actuator.controller, actuator.supply
     limits = {"voltage": actuator.voltage_limit, "most_voltage": loop.max_voltage}
     # With a resistance the limit sags from the supply's open-circuit voltage.
@@ -90,9 +93,10 @@ def _paper_loop(actuator: DCMotorActuator, period: float) -> dict[str, Any]:
 
 
 def _outer_loops(servo: Servo) -> dict[str, Any]:
-    """Return the parameters of a servo's loops at the rotor; None: no limit.
+    """Return the parameters of a servo's position and velocity loops, referred to the rotor.
 
-    They are those of `codrl_mj.actuators.servo.demand`.
+    They are those of `codrl_mj.actuators.servo.demand`. A limit of None means that there is no
+    limit.
     """
     loop, ratio = servo.loop, servo.motor.gear_ratio
     gain = loop.velocity_gain / ratio**2

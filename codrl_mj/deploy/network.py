@@ -1,6 +1,7 @@
-"""Weights of a trained policy, without the library that trained it: scaling, layers and bounds.
+"""A trained policy as numpy arrays, independent of the library that trained it.
 
-The module imports no large library: torch's tensors are converted to numpy arrays.
+The arrays are the scaling, the layers and the bounds. The module imports torch only while it
+extracts them.
 """
 
 import dataclasses
@@ -98,22 +99,22 @@ class Network:
         )
         return str(node("Add", node("Mul", share, self.high - self.low), self.low))
 
-    def __call__(self, observations: np.ndarray, kind: Any = np.float32) -> np.ndarray:
-        """Return actions (N, m) or indices (N,) for observations (N, k), in numbers of `kind`."""
+    def __call__(self, observations: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
+        """Return actions (N, m) or indices (N,) for observations (N, k), computed in `dtype`."""
         values = observations
         if (norm := self.normalization) is not None:
             values = np.clip((values - norm.mean) / norm.deviation, -norm.clip, norm.clip)
-        values = values.astype(kind) * self.factors.astype(kind)
+        values = values.astype(dtype) * self.factors.astype(dtype)
         for layer in self.layers:
             values = ACTIVATIONS[layer.activation](
-                values @ layer.weight.astype(kind).T + layer.bias.astype(kind)
+                values @ layer.weight.astype(dtype).T + layer.bias.astype(dtype)
             )
-        values = values * self.gains.astype(kind)
+        values = values * self.gains.astype(dtype)
         if self.low is None or self.high is None:
             return values.argmax(axis=1)
-        low, high = self.low.astype(kind), self.high.astype(kind)
+        low, high = self.low.astype(dtype), self.high.astype(dtype)
         return (
-            low + kind(0.5) * (values + kind(1.0)) * (high - low)
+            low + dtype(0.5) * (values + dtype(1.0)) * (high - low)
             if self.squashed
             else np.clip(values, low, high)
         )
@@ -162,8 +163,8 @@ def extract_network(policy: Policy) -> Network | Tiles:
             `codrl_mj.runs.policies.load_policy` returns it.
 
     Raises:
-        ValueError: the policy is of another class, or has parts other than factors and dense
-            layers.
+        ValueError: the policy is of another class, or has parts other than scaling factors and
+            dense layers.
     """
     if isinstance(policy, NormalizedPolicy):
         network, rms = extract_network(policy.policy), policy.statistics

@@ -1,9 +1,9 @@
-"""Simulated motors whose current loop is computed by the exported C, in another process.
+"""Simulated motors whose current loop is computed by the exported C code, in another process.
 
-A family's step runs with a single function replaced: instead of computing the voltage of a sample,
-`Drive`, `Servo` and the paper's `DCMotorActuator` request it from the process and apply it to the
-winding. Nothing else of a motor changes. The state of the loop is sent with each sample and
-returned, because the engine may evaluate a step twice.
+In the step of `Drive`, `Servo` and the paper's `DCMotorActuator` a single function is replaced:
+instead of computing the voltage of a sample, it requests the voltage from the process and applies
+it to the winding. Nothing else in a motor changes. The state of the loop is sent with each sample
+and returned, because the engine may evaluate a step twice.
 """
 
 import contextlib
@@ -30,8 +30,8 @@ _POLL_IN = 1 << 32
 # Compiled code has no access to Python objects. It shares this table: the settings and counters
 # below, the `pollfd` at 1, a sample from 8 on and its answer from 16 on.
 _TABLE = np.zeros(32)
-_table_at = named_address("codrl_mj_board", _TABLE.ctypes.data)
-_TO, _AMPERES, _CURRENT, _VOLTAGE, _SAMPLES, _LOST = 0, 2, 3, 4, 5, 6
+_table_address = named_address("codrl_mj_board", _TABLE.ctypes.data)
+_WRITE_FD, _AMPERES, _CURRENT_STEP, _VOLTAGE_STEP, _SAMPLES, _LOST = 0, 2, 3, 4, 5, 6
 # The C library of this process, whose functions compiled code can call.
 _C: Any = ctypes.CDLL(None)
 _size = types.uintp
@@ -62,21 +62,23 @@ def sample_on_board(
     Returns:
         The voltage [V] and the two states after the sample.
     """
-    table = f64(_table_at())
+    table = f64(_table_address())
     table[8], table[9], table[10] = (
         reference / table[_AMPERES],
-        quantized(measured, table[_CURRENT]),
+        quantized(measured, table[_CURRENT_STEP]),
         speed,
     )
     table[11], table[12] = integral, memory
     table[_SAMPLES] += 1.0
     received = 0
     # After a lost answer the later ones would belong to other samples, so nothing is sent any more.
-    if table[_LOST] == 0.0 and _write(int(table[_TO]), entry_address(table, 8), 40) == 40:
+    if table[_LOST] == 0.0 and _write(int(table[_WRITE_FD]), entry_address(table, 8), 40) == 40:
         # A pipe may deliver the 24 bytes of an answer in several parts.
         while received < 24 and _poll(entry_address(table, 1), 1, TIMEOUT_MS) > 0:
             count = _read(
-                u64(_table_at())[1] & 0xFFFFFFFF, entry_address(table, 16) + received, 24 - received
+                u64(_table_address())[1] & 0xFFFFFFFF,
+                entry_address(table, 16) + received,
+                24 - received,
             )
             if count <= 0:
                 break
@@ -84,7 +86,7 @@ def sample_on_board(
     if received < 24:
         table[_LOST] = 1.0
         return 0.0, integral, memory
-    return quantized(table[16], table[_VOLTAGE]), table[17], table[18]
+    return quantized(table[16], table[_VOLTAGE_STEP]), table[17], table[18]
 
 
 def advance_winding(
@@ -116,7 +118,7 @@ def advance_winding(
             applied = math.copysign(max(abs(applied) - parameters.deadband, 0.0), applied)
         steady_current = (applied - back_emf) / resistance
         deviation = current - steady_current
-        # The mean over the sample of the exponential decay to the steady current.
+        # Mean over the sample of the current, which decays exponentially to the steady current.
         mean_current = steady_current + deviation * decayed / x
         heat_sum += (
             steady_current * steady_current
@@ -201,19 +203,19 @@ def loop_on_board(
 
     Args:
         family: `Drive`, `Servo` or `DCMotorActuator`.
-        process: process with pipes, of the program that `board.c` becomes with `BOARD_DRIVE`.
-        amperes: current for a command of 1 [A].
+        process: process with pipes that runs `board.c`, compiled with `BOARD_DRIVE`.
+        amperes: current [A] for a command of 1.
         current_step: resolution of the measured current [A]; 0 for none.
         voltage_step: resolution of the bridge's voltage [V]; 0 for none.
 
     Returns:
-        A view of two numbers: the number of samples, and 1 if one was not answered.
+        A view of two numbers: the number of samples, and 1 if a sample was not answered.
     """
     board_family = type(
         family.__name__, (family,), {"advance": staticmethod(_ADVANCE[family]), "family": ""}
     )
     _TABLE[:] = 0.0
-    _TABLE[[_TO, _AMPERES, _CURRENT, _VOLTAGE]] = (
+    _TABLE[[_WRITE_FD, _AMPERES, _CURRENT_STEP, _VOLTAGE_STEP]] = (
         process.stdin.fileno(),
         amperes,
         current_step,

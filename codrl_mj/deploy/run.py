@@ -1,4 +1,4 @@
-"""Monitoring and driving of a real board at a serial port, and the log of its answers."""
+"""Runs of a real board at a serial port, which only reports or also drives, and their logs."""
 
 import contextlib
 import csv
@@ -27,7 +27,7 @@ from codrl_mj.deploy.wire import (
 from codrl_mj.runs.files import atomic_write
 
 MAX_MISSED = 3
-"""Number of consecutive frames without an answer after which a run that drives is ended."""
+"""Number of consecutive frames without an answer that ends a run which drives the motor."""
 
 
 class BoardRun(NamedTuple):
@@ -55,14 +55,14 @@ def run_board(
 ) -> BoardRun:
     """Request a board's observations and commands at the policy's rate until the run is ended.
 
-    The last frame sets the safe command. A run that drives also ends as soon as something is wrong;
-    this is checked in Python in addition to the checks of the C.
+    The last frame sets the safe command. A run that drives the motor also ends on the first error;
+    Python checks for errors in addition to the C code.
 
     Args:
         folder: a folder that `codrl_mj.deploy.export` wrote and that the board runs.
         port: serial port, such as `/dev/ttyACM0`.
-        log: CSV file for the answers, as `check_log` reads it, with the motors' voltage, current
-            and position.
+        log: CSV file for the answers, in the format of `check_log`, with the motors' voltage,
+            current and position.
         drive: True if the board gives the commands to its drive; otherwise it only reports them.
         seconds: longest duration [s].
         baud: bits per second.
@@ -162,7 +162,7 @@ def _open_port(port: str, baud: int) -> Any:
 
 
 def _stop_reason(contract: Contract, answer: Answer | None, num_consecutive: int) -> str:
-    """Return the reason why a board must stop driving, or ""."""
+    """Return the reason why a board must stop driving; "" if it may continue."""
     if answer is None:
         return (
             f"{num_consecutive} frames in a row had no answer"
@@ -171,19 +171,19 @@ def _stop_reason(contract: Contract, answer: Answer | None, num_consecutive: int
         )
     if answer.status & OLD:
         return (
-            "the board took a frame for old: it has had a frame of a later time, before this run:"
-            " reset it"
+            "the board refused a frame as old: it received a frame with a later time before this"
+            " run: reset the board"
         )
     if answer.status & (DAMAGED | NOT_FINITE):
         return (
-            "the board took a frame for damaged"
+            "the board refused a frame as damaged"
             if answer.status & DAMAGED
             else "a sensor's value is not finite"
         )
     if answer.status & BEYOND or not contract.is_within_limits(answer.observation[np.newaxis])[0]:
         names = [entry["name"] for entry in contract.observations]
         return (
-            "beyond the limits:"
+            "the observation is beyond the limits:"
             f" {dict(zip(names, answer.observation.round(4).tolist(), strict=True))}"
         )
     bounds = [

@@ -16,7 +16,7 @@ class Tiles:
     """A policy that takes the action with the largest sum of weights in an observation's tiles."""
 
     coder: TileCoder
-    """Function from an observation (k,) to its tiles, one in each tiling."""
+    """Tile coder that maps an observation (k,) to its tiles, one in each tiling."""
     table: np.ndarray
     """Weights, shape (tiles, actions), float64."""
     factors: np.ndarray
@@ -25,7 +25,7 @@ class Tiles:
     # Discrete actions have no bounds; `Network` has these attributes.
     low = high = None
 
-    def __call__(self, observations: np.ndarray, kind: Any = np.float32) -> np.ndarray:  # noqa: ARG002 - as a `Network`
+    def __call__(self, observations: np.ndarray, dtype: Any = np.float32) -> np.ndarray:  # noqa: ARG002 - as a `Network`
         """Return action indices (N,) for observations (N, k), always computed in double."""
         return choose_actions(
             observations, self.coder, self.table, True, 0.0, np.random.default_rng(0)
@@ -73,8 +73,8 @@ class Tiles:
     def as_csv(self, names: Sequence[str]) -> str:
         """Return the table with a row for each tile: tiling, index on each axis, weight per action.
 
-        An axis is an entry of the observation, or an angle, of which two entries are the cosine and
-        the sine.
+        An axis is one entry of the observation, or an angle whose cosine and sine are two
+        entries.
 
         Args:
             names: names of the observation's entries.

@@ -62,7 +62,7 @@ class Wire:
     def request(
         self, frame: bytes, sequence: int, timeout: float = ANSWER_TIMEOUT
     ) -> Answer | None:
-        """Send a frame and return the answer; None without one in time, or if it is damaged.
+        """Send a frame and return the answer; None if it does not come in time or is damaged.
 
         Args:
             frame: the bytes of a frame.
@@ -70,7 +70,7 @@ class Wire:
             timeout: longest wait for an answer [s].
 
         Raises:
-            RuntimeError: the controller ended.
+            RuntimeError: the controller's process has ended.
         """
         # If the controller has ended, the read below raises the error.
         with contextlib.suppress(BrokenPipeError):
@@ -86,7 +86,8 @@ class Wire:
         size, buffer, damaged = self._answer.size + 4, self._buffer, False
         deadline = time.monotonic() + timeout
         while True:
-            # Remove noise before the start. A last byte that may begin a start is kept.
+            # Remove noise before the start bytes. The last byte is kept if it may be the first of
+            # them.
             start = buffer.find(_START)
             del buffer[: start if start >= 0 else len(buffer) - buffer.endswith(_START[:1])]
             if len(buffer) >= size:
@@ -114,5 +115,5 @@ class Wire:
 
 
 def _framed(content: bytes) -> bytes:
-    """Return a frame: start, content, and the content's checksum (CRC-16/CCITT, from 0xFFFF)."""
+    """Return a frame: start bytes, content, and its CRC-16/CCITT with the initial value 0xFFFF."""
     return _START + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF))

@@ -47,7 +47,9 @@ class Episode:
     `codrl_mj.physics.trace_names`, each of shape (T*n,); with several motors (T*n, motors).
     """
     signals: dict[str, np.ndarray]
-    """Signals of the actuators at the end of each step, by name in `info`: (T,) or (T, motors)."""
+    """Signals of the actuators at the end of each step, by their names in `info`, shape (T,) or
+    (T, motors).
+    """
     terminated: bool
     """True if the task ended the episode. If False, the time limit did."""
     actuator: Any
@@ -198,8 +200,8 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
         raise ValueError(f"{path} is not the trajectory of an episode: {error}") from None
 
 
-# Memory [bytes] of the smallest environment; those of the built-in tasks take three to seven times
-# as much.
+# Memory [bytes] of the smallest environment. The environments of the built-in tasks need three to
+# seven times as much.
 _EPISODE_SIZE = 100_000
 _STEPS_BETWEEN_CHECKS = 10_000
 
@@ -214,7 +216,7 @@ def check_episodes(episodes: int, name: str = "episodes") -> None:
 
 
 class _Recording:
-    """Environment with a recording since its reset."""
+    """Environment and the recording of its episode."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], seed: int) -> None:
         """Reset the environment."""

@@ -56,7 +56,7 @@ class Evaluation:
     """Environment steps per episode."""
     success: Interval | None = _measure("success", "share")
     """Share of successful episodes, as defined by the task or by the `info` of a third-party
-    environment; None if neither defines it. Wilson's interval.
+    environment, with Wilson's interval; None if neither defines it.
     """
     failure: Interval | None = _measure("failure", "share")
     """Share of episodes that do not succeed."""
@@ -325,20 +325,18 @@ def _measures(
         ("tracking_rms", "tracking_percent", "tracking_max", "tracking_lag")
     )
     if all(tracked):
-        desired, delivered_desired = (
+        desired, tracked_actual = (
             [getattr(trace, name) for traces in tracked for trace in traces]
             for name in ("desired", "actual")
         )
         command = np.concatenate(desired)
-        error = command - np.concatenate(delivered_desired)
+        error = command - np.concatenate(tracked_actual)
         rms, scale = _root_mean_square(error), _root_mean_square(command)
         tracking = {
             "tracking_rms": rms,
             "tracking_percent": 100 * rms / scale if scale > 0 else None,
             "tracking_max": float(np.abs(error).max()),
-            "tracking_lag": delay(
-                desired, delivered_desired, episodes[0].timestep, len(tracked[0])
-            ),
+            "tracking_lag": delay(desired, tracked_actual, episodes[0].timestep, len(tracked[0])),
         }
     duration = math.fsum(episode.time[-1] for episode in episodes) * len(traces_by_episode[0])
     return {
@@ -359,9 +357,9 @@ def _root_mean_square(values: np.ndarray) -> float:
 def _electrical(
     episodes: Sequence[Episode], traces_by_episode: Sequence[Sequence[MotorTrace]]
 ) -> dict[str, Any]:
-    """Return the measures of non-ideal actuators and their windings; None without the signals."""
-    traces = (f"{limit}_saturated" for limit in ("voltage", "current", "temperature"))
-    limits = {f"{name}_percent": name for name in ("saturated", *traces)}
+    """Return the measures of non-ideal actuators and windings; None where signals are missing."""
+    signal_names = (f"{limit}_saturated" for limit in ("voltage", "current", "temperature"))
+    limits = {f"{name}_percent": name for name in ("saturated", *signal_names)}
     names = (
         "peak_voltage",
         "peak_current",

@@ -9,9 +9,9 @@ import numpy as np
 MIN_CORRELATION = 0.5
 """Smallest correlation for which a delay is returned; it explains a quarter of the variance."""
 EQUAL_CORRELATION = 0.99
-"""Share of the highest peak above which peaks count as equal.
+"""Share of the highest peak above which peaks count as equally high.
 
-A periodic signal has such a peak in each period; the first is the delay.
+A periodic signal has such a peak in each period; the first one is the delay.
 """
 
 
@@ -123,11 +123,11 @@ def delay(
     # scipy.signal takes most of a second to import; scipy.fft does not.
     from scipy import fft
 
-    reach = int(np.mean([len(desired_signal) for desired_signal in desired]) / 2)
+    max_lag = int(np.mean([len(desired_signal) for desired_signal in desired]) / 2)
     every_desired, every_actual = np.concatenate(desired), np.concatenate(actual)
-    if reach < 1 or np.ptp(every_desired) == 0 or np.ptp(every_actual) == 0:
+    if max_lag < 1 or np.ptp(every_desired) == 0 or np.ptp(every_actual) == 0:
         return None
-    lags = np.arange(-1, reach + 1)
+    lags = np.arange(-1, max_lag + 1)
     products, desired_squares, actual_squares = np.zeros((3, len(lags)))
     means = [
         [np.concatenate(signals[motor::motors]).mean() for signals in (desired, actual)]
@@ -160,8 +160,8 @@ def delay(
 def _parabolas(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return offsets and heights of parabolic peaks at all inner samples.
 
-    The parabola goes through a sample and its two neighbors. Offsets are relative to the sample
-    [1]; the height is -inf if the sample is not a peak. Shape (n,) each, for samples (n+2,). The
+    The parabola goes through a sample and its two neighbors. Offsets are in samples; the
+    height is -inf if the sample is not a peak. Shape (n,) each, for samples (n+2,). The
     first inner sample (lag 0) counts as a peak even if its left neighbor is higher.
     """
     before, center, after = samples[:-2], samples[1:-1], samples[2:]

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-_SEAL = "sha256"
+_DIGEST_KEY = "sha256"
 # Temporary names that tempfile makes from the prefix and suffix of `atomic_write`.
 _TEMPORARY = re.compile(r"\.(.+)-[a-z0-9_]{8}(\.[^.]+)?")
 
@@ -117,7 +117,7 @@ def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
     # Hash the content as it is after a round trip through JSON: keys are strings, tuples are lists.
     json_content = json.loads(json.dumps(content))
     return {
-        _SEAL: hashlib.sha256(json.dumps(json_content, sort_keys=True).encode()).hexdigest(),
+        _DIGEST_KEY: hashlib.sha256(json.dumps(json_content, sort_keys=True).encode()).hexdigest(),
         **json_content,
     }
 
@@ -165,13 +165,13 @@ def read_json(path: Path, kind: str) -> Any:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not a {kind}: it is truncated or not JSON ({error})") from None
-    if not isinstance(content, dict) or _SEAL not in content:
+    if not isinstance(content, dict) or _DIGEST_KEY not in content:
         return content
-    json_content = {name: value for name, value in content.items() if name != _SEAL}
-    if content[_SEAL] != with_digest(json_content)[_SEAL]:
+    json_content = {name: value for name, value in content.items() if name != _DIGEST_KEY}
+    if content[_DIGEST_KEY] != with_digest(json_content)[_DIGEST_KEY]:
         raise ValueError(
             f"{path} is not the {kind} that was written: its content does not match its entry"
-            f" {_SEAL}. It was damaged or edited: copy it again from its source, or delete the"
-            f" entry {_SEAL} if you edited it on purpose"
+            f" {_DIGEST_KEY}. It was damaged or edited: copy it again from its source, or delete"
+            f" the entry {_DIGEST_KEY} if you edited it on purpose"
         )
     return json_content

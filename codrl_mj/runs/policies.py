@@ -101,7 +101,7 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
         raise ValueError(
             f"{folder / DESCRIPTION}: not a policy of codrl_mj: its format must be {FORMAT!r}"
         )
-    # Without this check, a damaged name of the digest would pass as a missing digest.
+    # Without this check, a damaged key of the digest would count as a missing digest.
     if unknown_entries := description.keys() - _ENTRIES:
         raise ValueError(
             f"{folder / DESCRIPTION} has unknown entries:"
@@ -172,7 +172,7 @@ def load_sb3_zip(path: Path, agent: str, trust: bool, normalize: Path | str | No
 
     Raises:
         FileNotFoundError: a file does not exist.
-        ValueError: `trust` is False, the agent is unknown, or a file is not what it should be.
+        ValueError: `trust` is False, the agent is unknown, or a file has the wrong content.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no model at {path}")
@@ -278,8 +278,8 @@ def _check_normalization(path: Path, model: Any) -> None:
 def check_spaces(policy: Any, env: EnvConfig, exact: bool = True) -> None:
     """Raise if the spaces of an environment differ from those of a policy's training.
 
-    A space that the policy does not have is not compared. Without `exact`, a difference only in the
-    bounds of the actions causes a warning instead of an error.
+    A space that the policy does not have is not compared. If `exact` is False, a difference
+    in nothing but the bounds of the actions causes a warning instead of an error.
     """
     if all(getattr(policy, name, None) is None for name in ("observation_space", "action_space")):
         return

@@ -83,7 +83,7 @@ class RunSummary:
 
 
 def find_runs(root: Path) -> list[RunSummary]:
-    """Return the runs in a folder and its subfolders by name; hidden folders are skipped."""
+    """Return the runs in a folder and its subfolders, sorted by name; skip hidden folders."""
     if not root.is_dir():
         raise FileNotFoundError(f"no folder {root} to search for runs")
     runs = []
@@ -110,7 +110,7 @@ def median_seed(evaluation: Mapping[str, Any] | None) -> int | None:
 
 
 def describe_rank(evaluation: Mapping[str, Any] | None, total: float) -> str:
-    """Return a text comparing an episode's return with an evaluation; empty without evaluation."""
+    """Return a text that compares an episode's return with an evaluation; "" without evaluation."""
     if (seed := median_seed(evaluation)) is None or evaluation is None:
         return ""
     returns = evaluation["episode_returns"]
@@ -119,8 +119,8 @@ def describe_rank(evaluation: Mapping[str, Any] | None, total: float) -> str:
         sum(value < total for value in returns),
     )
     return (
-        f"of {len(returns)} evaluated episodes {num_lower} returned less, the median {median:.3g}"
-        f" (seed {seed})"
+        f"{num_lower} of {len(returns)} evaluated episodes had a lower return; the median is"
+        f" {median:.3g} (seed {seed})"
     )
 
 
@@ -261,7 +261,7 @@ def _modified(folder: Path) -> float | None:
 
 
 def _first(name: str, *sources: Mapping[str, Any] | None) -> float | None:
-    """Return the first finite number among the values of a name in some mappings; None if none."""
+    """Return the first finite number among the mappings' values of a key; None if there is none."""
     numbers = (_number((source or {}).get(name)) for source in sources)
     return next((number for number in numbers if number is not None), None)
 
@@ -338,7 +338,7 @@ def compare(runs: Sequence[RunSummary]) -> Comparison:
     if len(runs) < 2:
         raise ValueError(f"runs: got {len(runs)}: a comparison needs two or more")
     named = [{**run.configuration, "env.actuator": run.actuator} for run in runs]
-    # The ideal actuator has no fields to compare, so only the actuators' names are.
+    # The ideal actuator has no fields, so only the names of the actuators are compared.
     if any(run.actuator == "ideal" for run in runs):
         named = [
             {key: value for key, value in entry.items() if not key.startswith("env.actuator.")}

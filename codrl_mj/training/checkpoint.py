@@ -1,7 +1,7 @@
 """Checkpoints: files with the complete state of a training.
 
-They are written atomically, contain a digest of their content in their names, and contain no code.
-A state is everything that the rest of a training depends on: weights, optimizers, replay buffer,
+They are written atomically, have a digest of their content in their names, and contain no code. A
+state is everything on which the rest of a training depends: weights, optimizers, replay buffer,
 exploration noise, counters, environments and all random generators. Nothing is pickled. Rollout
 buffers are omitted, because states are captured between two rollouts, when they are empty.
 """
@@ -93,7 +93,7 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
 
 
 def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
-    """Restore the result of `capture` in a model of the same configuration, within its `learn`.
+    """Restore the result of `capture` in a model of the same configuration while it learns.
 
     Raises:
         ValueError: the state belongs to another configuration. Model and environments are then
@@ -176,8 +176,8 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
     Args:
         folder: folder of checkpoints.
         state: the state.
-        run: identity of the run, its configuration. A run is never continued from a checkpoint with
-            another identity.
+        run: identity of the run: its configuration as text. A run never continues from a checkpoint
+            with another identity.
 
     Returns:
         The path of the checkpoint.
@@ -192,8 +192,8 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
         os.fsync(file.fileno())
     existing = find_checkpoints(folder)
     older = [name for name, parts in existing.items() if parts["step"] < step]
-    # All other files are obsolete: older ones, ones of the same step, and damaged ones of a later
-    # step, before which the run was resumed.
+    # All other files are obsolete: older ones, ones of the same step, and damaged ones of later
+    # steps, which are left over if the run was resumed from an earlier checkpoint.
     for obsolete in existing.keys() - {path, *older[1 - NUM_CHECKPOINTS :]}:
         obsolete.unlink(missing_ok=True)
     return path

@@ -23,7 +23,7 @@ class TrainConfig(Checked):
 
     Raises:
         ValueError: a field is out of bounds, or the agent cannot act in the task; the message names
-            what is possible.
+            the alternatives.
     """
 
     env: EnvConfig
@@ -76,7 +76,7 @@ class TrainConfig(Checked):
 
     @property
     def actuator(self) -> Any:
-        """Actuator in training; a tuple if there are several motors, or patterns of them."""
+        """Actuator in training; a tuple if there are several motors or patterns of motor names."""
         return self.env.actuator
 
     @property
@@ -99,7 +99,8 @@ class TrainConfig(Checked):
         Args:
             task: task name.
             agent: the agent's name.
-            settings: a name of `SETTINGS`: `default`; for some pairs `paper`, `repaired` or `fast`.
+            settings: a name of `SETTINGS`: `default`; for some pairs of task and agent `paper`,
+                `repaired` or `fast`.
             actuator: actuator in training.
             env: values of other fields of the environment, and of options of the task.
             **changes: values of other fields.
@@ -196,8 +197,8 @@ def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConf
         path: the file; the `config.json` of a run folder is possible, too.
         trust: import, and thereby execute, the module of an actuator that the file names as
             `module:NAME`.
-        **overriding: values that replace top-level keys of the file. None has no effect. An agent
-            with the name that is in the file keeps the settings in the file.
+        **overriding: values that replace top-level keys of the file. None has no effect. If `agent`
+            is the agent in the file, its settings in the file are kept.
 
     Raises:
         FileNotFoundError: there is no such file.

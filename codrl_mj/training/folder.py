@@ -1,4 +1,4 @@
-"""Run folders: their files, the record of the software versions, and their lock in a training."""
+"""Run folders: their files, the record of the software versions, and the lock during training."""
 
 import contextlib
 import functools
@@ -137,7 +137,7 @@ def resume_command(run: Path) -> str:
     return command("train", "--resume", run, trust=needs_trust(run))
 
 
-def describe_remains(run: Path) -> str:
+def describe_resumption(run: Path) -> str:
     """Return a sentence on how to continue a training that was interrupted."""
     if existing := find_checkpoints(run / CHECKPOINTS):
         step = max(int(parts["step"]) for parts in existing.values())
@@ -151,7 +151,7 @@ def describe_remains(run: Path) -> str:
 
 
 def _leftovers(folder: Path) -> list[Path]:
-    """Return temporary files of a training that were not completed."""
+    """Return the temporary files in which a killed training was writing."""
     return [
         path
         for path, name in temporary_files(folder)
@@ -251,9 +251,9 @@ def _code_digest(*extra: str | Path) -> str:
 
 @contextlib.contextmanager
 def locked_for_training(run: Path, exists: bool) -> Iterator[None]:
-    """Lock a run folder in a `with` block, and delete a new one if the block fails before a result.
+    """Lock a run folder in a `with` block; delete a new folder if the block fails without results.
 
-    A result is a checkpoint or a best policy.
+    Results are a checkpoint or a best policy. `exists` is True if the folder has a run to continue.
     """
     new_folders = [path for path in (run, *run.parents) if not path.exists()]
     with locked(run):

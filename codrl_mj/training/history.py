@@ -30,9 +30,8 @@ class Progress:
     mean_length: float
     """Mean length of the same episodes [steps]."""
     torque_error: float
-    """Root mean square of desired minus delivered torque at the motor shaft [N*m] at the ends of
-    the environment steps since the last report. That of an evaluation is over all integration
-    steps.
+    """Root mean square of desired minus delivered torque at the motor shaft [N*m], over the ends of
+    the environment steps since the last report. An evaluation takes it over all integration steps.
     """
     evaluation_return: float
     """Mean return of the evaluation at this step (NaN if there was none)."""
@@ -68,7 +67,7 @@ def learning_curves(
 ) -> list[Curve]:
     """Return curves of returns over environment steps.
 
-    They are those of the training episodes, of their running mean, and of the evaluations.
+    The curves show the training episodes, their running mean, and the evaluations.
 
     Args:
         episodes: rows of `EPISODE_COLUMNS`.

@@ -26,7 +26,7 @@ def train(
     tensorboard: bool = True,
     wandb: str | None = None,
 ) -> Path:
-    """Train an agent into a run folder, or continue the training of one.
+    """Train an agent and write a run folder, or continue an interrupted training.
 
     The folder grows while the agent trains: `config.json` (resolved configuration, versions, digest
     of the code), `progress.csv` and `episodes.csv`, `checkpoints/`, `best/` (the policy of the best
@@ -41,8 +41,9 @@ def train(
         config: configuration of the training.
         out: the run folder.
         on_progress: function that is called at the ends of rollouts.
-        resume: continue the run in `out` from its last intact checkpoint, to the same result as
-            that of an uninterrupted run. Start it if there is none, and return if it is finished.
+        resume: continue the run in `out` from its last intact checkpoint, with the same result as
+            an uninterrupted run. Start a run if there is none, and return at once if it is
+            finished.
         accept_changes: continue even if code or package versions differ from those at its start.
         tensorboard: write events for TensorBoard, if it is installed.
         wandb: name of a Weights & Biases project that also gets the reports.
@@ -86,8 +87,8 @@ def train(
             watcher = Watcher(config, out, stop_signals, on_progress, tensorboard)
             with contextlib.closing(watcher), watcher.explaining_errors():
                 if record is not None:
-                    # The configuration is the first file, so that a folder with other files of a
-                    # run always has it.
+                    # The configuration is written first, so that every folder with files of a run
+                    # has it.
                     write_json(out / CONFIG, with_digest(record))
                 steps = config.total_steps
                 if steps is None:
@@ -146,7 +147,7 @@ def _wandb_context(
         dir=out,
         config=config.as_mapping(),
         sync_tensorboard=True,
-        # The id is that of the folder, so that a continued run continues there, too.
+        # The id depends on the folder alone, so that a resumed run continues the same record.
         id=hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:16],
         resume="allow",
     )

@@ -32,7 +32,7 @@ from codrl_mj.training.history import EPISODE_COLUMNS, REPORT_COLUMNS, GrowingTa
 REPORT_INTERVAL = 1000
 """Environment steps between two reports, rounded up to the end of a rollout."""
 _RATES = ("learning_rate", "critic_learning_rate", "step_size")
-_REMEMBERED = ("marks", "squares", "samples", "best")
+_CHECKPOINTED = ("marks", "squares", "samples", "best")
 
 
 class LearningEnded(Exception):  # noqa: N818 - no error
@@ -50,7 +50,7 @@ class Watcher(BaseCallback):
         on_progress: Callable[[Progress], None] | None,
         tensorboard: bool,
     ) -> None:
-        """Take the arguments of `train`, and the list of signals that stop the training."""
+        """Store the arguments of `train`, and the list of signals that stop the training."""
         super().__init__()
         self._config, self._out, self._stop_signals, self._on_progress = (
             config,
@@ -82,7 +82,7 @@ class Watcher(BaseCallback):
         if state is not None:
             restore(self.model, self.training_env, state)
             rows = {name: state.arrays[f"watch.{name}"] for name in rows}
-            for name in (*_REMEMBERED, "seconds_before"):
+            for name in (*_CHECKPOINTED, "seconds_before"):
                 setattr(self, f"_{name}", state.facts["watch"][name])
             self.saved_steps = self._steps_before = self.model.num_timesteps
             self.num_timesteps = self.model.num_timesteps
@@ -116,7 +116,8 @@ class Watcher(BaseCallback):
             raise folder.TrainingStoppedError(message, self._stop_signals[-1])
 
     def _on_step(self) -> bool:
-        # An agent's compiled loop takes several steps a call, and has the signals of all of them.
+        # An agent's compiled loop takes several steps in one call, and passes the signals of all of
+        # them.
         signals = self.locals.get("signals", self.training_env.signals)  # type: ignore[attr-defined]
         if signals is not None:
             errors = np.subtract(signals["desired_force"], signals["actual_force"]).reshape(
@@ -148,17 +149,17 @@ class Watcher(BaseCallback):
 
     @contextlib.contextmanager
     def explaining_errors(self) -> Iterator[None]:
-        """Add the state of the run to errors: a full disk, a second Ctrl-C, weights not finite."""
+        """Add explanations to errors: how to continue the run, or why the weights diverged."""
         try:
             yield
         except OSError as error:
             raise OSError(
                 f"training in {self._out} was interrupted: {error}."
-                f" {folder.describe_remains(self._out)}"
+                f" {folder.describe_resumption(self._out)}"
             ) from error
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
-                f"stopped at once. {folder.describe_remains(self._out)}"
+                f"stopped at once. {folder.describe_resumption(self._out)}"
             ) from None
         except Exception:
             self._check_weights()
@@ -183,7 +184,7 @@ class Watcher(BaseCallback):
     # -- between two rollouts ---------------------------------------------------------------------
 
     def run_due_actions(self, stopping: bool = False, last: bool = False) -> None:
-        """Report, evaluate and write a checkpoint, if they are due.
+        """Report, evaluate and write a checkpoint, each if it is due.
 
         Args:
             stopping: write a checkpoint in any case.
@@ -218,7 +219,7 @@ class Watcher(BaseCallback):
             self._save_policy(self._out / BEST, self.evaluation)
 
     def _save_policy(self, path: Path, evaluation: Evaluation) -> None:
-        """Write the present policy with its evaluation."""
+        """Write the current policy with its evaluation."""
         save_policy(self.model.policy, self._config.agent, path)
         write_json(path / EVALUATION, with_digest(evaluation.as_mapping()))
 
@@ -252,7 +253,7 @@ class Watcher(BaseCallback):
 
     def _save(self) -> None:
         arrays, facts = capture(self.model, self.training_env)
-        watch = {name: getattr(self, f"_{name}") for name in _REMEMBERED}
+        watch = {name: getattr(self, f"_{name}") for name in _CHECKPOINTED}
         watch["seconds_before"] = self._seconds_before + time.perf_counter() - self._start
         tables = {"watch.episodes": self.episodes.array(), "watch.reports": self.reports.array()}
         state = State(arrays | tables, facts | {"watch": watch})

@@ -1,4 +1,8 @@
-"""Certificate of the port: checks against independent oracles, and faults that must fail them."""
+"""Certificate of the port of Gymnasium's tasks to MuJoCo.
+
+Its checks compare simulations with independent references, called oracles. Deliberate faults show
+that each check can fail.
+"""
 
 from codrl_mj.validation.certificate import GROUPS, Certificate, validate, validate_model
 from codrl_mj.validation.mutations import MUTATIONS, Mutation, MutationResult, try_mutations

@@ -16,7 +16,7 @@ from codrl_mj.engine.specs import NO_ACTUATORS_READ
 from codrl_mj.physics import install_callbacks, motors
 from codrl_mj.tasks import PAPER_TASKS, TASKS, find_task
 from codrl_mj.validation import execution, own_model
-from codrl_mj.validation.compare import is_ours
+from codrl_mj.validation.compare import is_built_in
 from codrl_mj.validation.table import REPORT, Check, Skipped
 
 GROUPS: dict[str, str] = {
@@ -29,8 +29,8 @@ GROUPS: dict[str, str] = {
 }
 """Title of each group of checks, in the order in which they run."""
 
-WITHOUT_TASK = ("motor",)
-"""Groups that run once for all built-in tasks, and once more for each custom task."""
+TASK_INDEPENDENT = ("motor",)
+"""Groups that run once for all built-in tasks together, and once for each custom task."""
 
 DIVERGED = "runs to its end"
 """Name of the check that fails if a simulation diverges."""
@@ -59,7 +59,7 @@ class Certificate:
     quick: bool
     """True for the quick form, which has fewer states, runs and step sizes."""
     seconds: float
-    """Duration of all checks [s]."""
+    """Total duration of the checks [s]."""
 
     @property
     def passed(self) -> bool:
@@ -196,7 +196,7 @@ _LIKELY_CAUSES = {
 
 def _likely_cause(check: Check) -> str:
     """Return the likely cause of a failed check, derived from its task, name and group."""
-    if not check.task or (check.task in TASKS and is_ours(TASKS[check.task])):
+    if not check.task or (check.task in TASKS and is_built_in(TASKS[check.task])):
         return REPORT
     if check.name == DIVERGED or check.name.startswith("stable: "):
         return (
@@ -207,7 +207,7 @@ def _likely_cause(check: Check) -> str:
 
 
 def _convert_errors(outcomes: Outcomes) -> Outcomes:
-    """Yield the results; a missing library skips the rest, a divergence is a failed check."""
+    """Yield the results; a missing library skips the rest, a divergence becomes a failed check."""
     try:
         yield from outcomes
     except ModuleNotFoundError as error:
@@ -255,7 +255,7 @@ def validate(
             )
 
     def run_group(group: str, task: str | None) -> Outcomes:
-        module = "own_model" if group in WITHOUT_TASK and task is not None else group
+        module = "own_model" if group in TASK_INDEPENDENT and task is not None else group
         # The import is local because some groups need optional libraries. A missing library then
         # skips its own group only (`_convert_errors`).
         yield from importlib.import_module(f"codrl_mj.validation.{module}").checks(task, quick)
@@ -264,7 +264,7 @@ def validate(
         (group, task or "", run_group(group, task))
         for group in GROUPS
         if group in selected_groups
-        for task in ([None, *custom_tasks] if group in WITHOUT_TASK else names)
+        for task in ([None, *custom_tasks] if group in TASK_INDEPENDENT else names)
     ]
     subject = "all tasks" if len(names) == len(TASKS) else ", ".join(names)
     return _certify(subject, parts, (), quick, on_part)
@@ -292,7 +292,7 @@ def validate_model(
     if not model.nactuator:
         raise ValueError(
             f"the model has no actuators ({NO_ACTUATORS_READ}): add one per joint, put motors"
-            " behind them with codrl_mj.add_motors, and validate what it makes"
+            " behind them with codrl_mj.add_motors, and validate the resulting model"
         )
     if not motors(model):
         raise ValueError(

@@ -38,7 +38,7 @@ def differences(task: Task, ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
     return gap / np.maximum(1.0, np.abs(oracle))
 
 
-def is_ours(task: Task) -> bool:
+def is_built_in(task: Task) -> bool:
     """Return True if the task comes with this package."""
     return task.reward.__module__.startswith("codrl_mj.")
 
@@ -46,7 +46,7 @@ def is_ours(task: Task) -> bool:
 def missing_oracle_reason(task: Task) -> str:
     """Return the reason why a task cannot be compared with Gymnasium step by step, or ""."""
     reason = (
-        "the task has several motors, and the commands are made for one motor"
+        "the task has several motors, and the commands of these checks are for one motor"
         if len(task.motors) > 1
         else ""
     )
@@ -94,7 +94,7 @@ def paper_actuators(task: Task) -> tuple[DCMotorActuator, ...]:
 
 
 def scaled_forces(task: Task, shares: np.ndarray) -> np.ndarray:
-    """Return desired forces for `Physics.step`, one row a step, from shares of the largest force.
+    """Return desired forces for `Physics.step`, one row per step, from shares of the largest force.
 
     `shares` has the shape (steps * motors,).
     """
@@ -108,7 +108,7 @@ STATE_BOUNDS = {
     "min_position": -math.inf,
     "max_position": math.inf,
 }
-"""Attributes that bound the states of environments -> values that bound nothing."""
+"""Attribute that bounds the states of an environment -> value that removes the bound."""
 
 Equations = Callable[[np.ndarray, Any], np.ndarray]
 """(mechanical state, force [N or N*m], an array for several motors) -> derivative of the state."""
@@ -118,10 +118,10 @@ def gymnasium_equations(task: Task, dt: float | None = None) -> Equations:
     """Return the right-hand side of a task's equations of motion, read from its environment.
 
     No equation is copied. A reference environment may have its right-hand side as a method
-    (Acrobot). The others take Euler steps, whose new velocity is v + a*dt, linear in dt: one step
-    of the environment gives a = (v_new - v)/dt, and the derivative of a position is its velocity.
-    The environment's bounds are removed. dt [s] is a power of two, or None for the largest one that
-    is at most a quarter of an environment step.
+    (Acrobot). The others take Euler steps, whose new velocity is v + a*dt. One step of the
+    environment therefore gives the acceleration a = (v_new - v)/dt, and the derivative of a
+    position is its velocity. The environment's bounds are removed. dt [s] is a power of two, or
+    None for the largest one that is at most a quarter of an environment step.
     """
     assert task.reference_env is not None
     # A reference environment has few declared attributes; bounds are found by their names.

@@ -1,18 +1,19 @@
 """Orders at which MuJoCo and Gymnasium's dynamics converge to one solution as the step shrinks.
 
-The solution is scipy's, of the equations that Gymnasium's environment has (`gymnasium_equations`).
-For a task without a reference environment it is the solution of MuJoCo's accelerations, which
-checks the integrator and the motors. With the ideal actuator the Euler variants promise first order
-and RK4, under a force held over the step, fourth. With a motor all promise first order: its winding
-takes Euler steps, and its torque is held over the mechanical step.
+The solution is computed by scipy from the equations of motion of Gymnasium's environment
+(`gymnasium_equations`). For a task without a reference environment it is computed from MuJoCo's
+accelerations, which still checks the integrator and the motors. With the ideal actuator and a force
+that is held over the step, the Euler variants promise first order and RK4 fourth order. With a
+motor all promise first order, because its winding takes Euler steps and its torque is held over the
+mechanical step.
 
 The runs stay away from bounds and walls (`free_run`): a clip is not smooth, and the step at which
 it acts moves with the step size. What happens at the bounds is compared step by step elsewhere.
 
 The last check makes the current loop faster instead. Its PI gains cancel the winding's pole, kI =
 kP*R/L, which leaves a first-order lag of time constant tau = L/kP. A force that lags by tau moves
-the mechanics as if switched tau too late: the actuated task approaches Gymnasium's at first order
-in tau.
+the mechanics as if it were switched tau too late, so the actuated task approaches Gymnasium's at
+first order in tau.
 """
 
 import dataclasses
@@ -39,7 +40,7 @@ from codrl_mj.validation.compare import (
     NO_REFERENCE_ENV,
     Equations,
     gymnasium_equations,
-    is_ours,
+    is_built_in,
     named_actuators,
     paper_actuators,
     physics_classes,
@@ -59,20 +60,20 @@ from codrl_mj.validation.table import (
 
 
 def free_run(task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return initial state and forces of the run of `Task.reference_states`, or of a short run.
+    """Return initial state and forces of the run of `Task.reference_states`.
 
-    The run is the same on every call.
+    A task without them gets a short run. The run is the same on every call.
 
     Returns:
-        Initial state; desired forces, the largest in either direction, each held for one
-        environment step; and the first of these forces, over which energies are balanced.
+        Initial state; desired forces, the largest ones in random directions, each held for one
+        environment step; and the first of these forces, over which the energies are balanced.
     """
-    trials = task.reference_states
-    steps, balanced = (6, 2) if trials is None else (trials.steps, trials.balanced_steps)
+    reference = task.reference_states
+    steps, balanced = (6, 2) if reference is None else (reference.steps, reference.balanced_steps)
     start = (
         task.draw_initial_state(np.random.default_rng(3), None)
-        if trials is None
-        else np.array(trials.start)
+        if reference is None
+        else np.array(reference.start)
     )
     forces = scaled_forces(
         task, np.random.default_rng(3).choice([-1.0, 1.0], steps * len(task.motors))
@@ -124,7 +125,7 @@ def _simulated_states(
 
 
 def _error(states: np.ndarray, solution: np.ndarray) -> float:
-    """Return the largest difference of any entry, relative to its largest size in the run."""
+    """Return the largest difference of any entry, relative to the entry's maximum in the run."""
     return float((np.abs(states - solution).max(axis=0) / np.abs(solution).max(axis=0)).max())
 
 
@@ -231,11 +232,14 @@ def halving_range(task: Task, max_halvings: int = 4) -> range:
     # Without `Task.reference_states` the run is arbitrary and may be violent: it begins with finer
     # steps.
     first = 2 if task.reference_states is None else 0
-    return range(first, first + (1 if is_ours(task) else max_halvings + 1), 2)
+    return range(first, first + (1 if is_built_in(task) else max_halvings + 1), 2)
 
 
 def coarsest_passing(task: Task, evaluate: Callable[[int], Case], max_halvings: int = 4) -> Case:
-    """Return the case of the coarsest steps with the promised order, or of the finest steps."""
+    """Return the case of the coarsest steps with the promised order.
+
+    If no steps have it, return the case of the finest ones.
+    """
     for extra_halvings in halving_range(task, max_halvings):
         case = evaluate(extra_halvings)
         if case.gaps <= ORDER_TOLERANCE:
@@ -247,7 +251,7 @@ def attribute_failure(
     task: Task, outcome: Check, evaluate: Callable[[int], tuple[float, str]], promised: float
 ) -> Check | Skipped:
     """Add the cause to a failed check of a custom task; skip it if textbook steps fail as well."""
-    if outcome.passed or is_ours(task):
+    if outcome.passed or is_built_in(task):
         return outcome
     distance, finding = min(map(evaluate, halving_range(task)))
     if distance <= ORDER_TOLERANCE:
@@ -293,7 +297,7 @@ def order_in_the_step(
     counts: Callable[[int], np.ndarray],
     promised: float,
 ) -> Iterator[Case]:
-    """Check that the errors of the solution vanish at the integrator's order."""
+    """Check that the errors relative to the solution vanish at the integrator's order."""
 
     def evaluate(extra_halvings: int) -> Case:
         series = []
@@ -321,7 +325,7 @@ def order_in_the_step(
 def rate_in_the_bandwidth(task: Task, quick: bool) -> Iterator[Case]:
     """Check that the actuated task approaches the ideal one at first order in the loop's lag.
 
-    Two integration steps resolve the lag at every bandwidth; both runs take the same steps.
+    At every bandwidth there are two integration steps per lag, the same in both runs.
     """
     integrator, physics = task.integrators[0], physics_classes(task)
     motors = [Motor(arm_radius=actuator.motor.arm_radius) for actuator in paper_actuators(task)]

@@ -98,7 +98,7 @@ def _stepped(
     ),
 )
 def one_step(
-    task: Task, trials: ReferenceStates, integrator: str, quick: bool
+    task: Task, reference: ReferenceStates, integrator: str, quick: bool
 ) -> Iterator[tuple[Case, ...]]:
     """Compare one integration step with an ideal actuator.
 
@@ -111,12 +111,14 @@ def one_step(
         task.max_force,
         len(task.state_names) == 2,
     )
-    bounds, samples = np.array(trials.bounds), 200 if quick else 10_000
+    bounds, samples = np.array(reference.bounds), 200 if quick else 10_000
     states = generator.uniform(-bounds, bounds, (samples, len(bounds)))
     forces = generator.uniform(-limit, limit, samples)
-    edges = np.array(list(itertools.product(*trials.edges)))[:: 5 if quick and not is_planar else 1]
+    edges = np.array(list(itertools.product(*reference.edges)))[
+        :: 5 if quick and not is_planar else 1
+    ]
     at_edges = _crossed(edges, limit * np.array([-EXTREME, -1.0, 0.0, 1.0, EXTREME]))
-    grid_states = grid(trials.bounds, 3 if quick else (21 if is_planar else 5))
+    grid_states = grid(reference.bounds, 3 if quick else (21 if is_planar else 5))
     beyond = _crossed(grid_states, limit * np.array([-EXTREME, -1.001, 1.001, EXTREME]))
     yield (
         _stepped(task, integrator, states, forces, limit),
@@ -126,10 +128,11 @@ def one_step(
 
 
 @check("dynamics", Check("accelerations", "{task.oracle}", TOLERANCE))
-def accelerations(task: Task, trials: ReferenceStates, points: int) -> Iterator[Case]:
+def accelerations(task: Task, reference: ReferenceStates, points: int) -> Iterator[Case]:
     """Compare `qacc` on a dense grid of states, under no, half, full and extreme forces."""
     states, forces = _crossed(
-        grid(trials.bounds, points), task.max_force * np.array([-EXTREME, -1.0, 0.0, 0.5, EXTREME])
+        grid(reference.bounds, points),
+        task.max_force * np.array([-EXTREME, -1.0, 0.0, 0.5, EXTREME]),
     )
     physics, _ = physics_pair(task, IDEAL, task.integrators[0], max_force=EXTREME * task.max_force)
     equations, velocities = gymnasium_equations(task, dt=1.0), list(task.qvel)
@@ -149,7 +152,7 @@ def accelerations(task: Task, trials: ReferenceStates, points: int) -> Iterator[
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
-    """Run the checks of dynamics of a task."""
+    """Run the dynamics checks of a task."""
     task = find_task(task_name)
     reason = missing_oracle_reason(task)
     if reason or task.reference_states is None:

@@ -10,12 +10,13 @@ Three balances, each over a run with the motor in the loop, in MuJoCo and on Gym
   kE = kT, and the same gear in both directions. Only the first two balances find a wrong gear
   ratio.
 
-A step of finite size balances only nearly: the residuals must vanish at the integrator's order. The
-order is first for the Euler variants and for every balance with the winding, which takes Euler
-steps. The mechanical balance under RK4 is of fourth order, because the work of a force held over a
-step is known exactly; with damping it is of second order, because the loss is integrated by the
-trapezoidal rule. It is checked without the motor: a motor's torque at a given time depends on the
-step at first order, so that runs at two step sizes would not see the same forces.
+With a finite step the balances hold only approximately: the residuals must vanish at the
+integrator's order. The order is first for the Euler variants and for every balance with the
+winding, which takes Euler steps. The mechanical balance under RK4 is of fourth order, because the
+work of a force held over a step is known exactly. With damping it is of second order, because the
+loss is integrated by the trapezoidal rule. It is checked without the motor: a motor's torque
+depends on the step size at first order, so that runs with two step sizes would have different
+forces.
 
 One balance holds at any step: an Euler step of the winding, times the mean current, is the identity
 (u - kE*omega - R*i) (i + i') dt/2 = L (i'^2 - i^2)/2. It is checked to rounding over whole episodes
@@ -37,7 +38,7 @@ from codrl_mj.user_code import asset_path
 from codrl_mj.validation.compare import (
     FALLBACK_ACTUATOR,
     gymnasium_equations,
-    is_ours,
+    is_built_in,
     named_actuators,
     physics_classes,
     scaled_forces,
@@ -77,10 +78,10 @@ BALANCES = {
 class Meter:
     """Kinetic and potential energy of a task's states, by MuJoCo on the original model file.
 
-    MuJoCo's `mj_energyPos` and `mj_energyVel` include gravity, springs and motion. A hill is a
-    force of codrl_mj, which they do not include: its potential is minus the integral of the force
-    that *Gymnasium's* environment has along it, a Chebyshev interpolant of 48 samples, exact to
-    rounding.
+    MuJoCo's `mj_energyPos` and `mj_energyVel` include gravity, springs and motion. They do not
+    include a hill, which is a force of codrl_mj. Its potential is minus the integral of the force
+    in *Gymnasium's* environment along the hill. The force is a Chebyshev interpolant of 48 samples,
+    which is exact to rounding.
     """
 
     def __init__(self, task: Task) -> None:
@@ -95,7 +96,7 @@ class Meter:
         hilly = bool(hills(self._model))
         if hilly and task.reference_env is None:
             raise ValueError(
-                "the model has a hill, whose height only a reference environment tells"
+                "the model has a hill, whose height can only be read from a reference environment"
             )
         self._hill = hill_potential(task, float(self._model.body_mass[-1])) if hilly else None
         options = self._model.opt
@@ -138,7 +139,7 @@ def hill_potential(task: Task, mass: float) -> Callable[[float], float]:
 
 @dataclasses.dataclass(frozen=True)
 class Ledger:
-    """Energies [J] from the start of a run to each of some times, each of shape (times,).
+    """Energies [J] since the start of a run at several times, each of shape (times,).
 
     Electrical energies are sums over the motors.
     """
@@ -160,7 +161,7 @@ class Ledger:
     lost: np.ndarray
     """Integral of the loss in dampers and medium, by the trapezoidal rule; zeros without any."""
     identity_error: float
-    """Largest error of the winding's identity in a step, over the largest energy supplied.
+    """Largest error of the winding's identity in a step, relative to the largest energy supplied.
 
     The error is |(u - kE*omega - R*i)*(i + i')*dt/2 - L*(i'^2 - i^2)/2|.
     """
@@ -189,7 +190,7 @@ def record_energies(
 ) -> Ledger:
     """Simulate a run and record its energies.
 
-    Each force is held for one environment step, of which `entries` times are recorded; `entries`
+    Each force is held for one environment step, in which `entries` times are recorded; `entries`
     must divide `inner_steps`. The task's bounds should not be reached: the energy that they take is
     not recorded. With ideal actuators all electrical energies are zero.
     """
@@ -224,10 +225,10 @@ def record_energies(
     speeds = list(task.speed_indices)
     positions = [task.qpos[task.qvel.index(speed)] for speed in speeds]
     back_emf = back_emf_constant * state[:, speeds] / arm
-    mean = (current[1:] + current[:-1]) / 2
+    mean_current = (current[1:] + current[:-1]) / 2
     magnetic = inductance * current**2 / 2
-    supplied = np.cumsum(voltage * mean, axis=0).sum(axis=1) * timestep
-    winding = (voltage - back_emf[:-1] - resistance * current[:-1]) * mean * timestep
+    supplied = np.cumsum(voltage * mean_current, axis=0).sum(axis=1) * timestep
+    winding = (voltage - back_emf[:-1] - resistance * current[:-1]) * mean_current * timestep
     meter, steps_per_entry = Meter(task), inner_steps // entries
     recorded = slice(steps_per_entry - 1, None, steps_per_entry)
     lost = (
@@ -414,7 +415,7 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     if reason:
         yield Skipped("the balances of a whole run", reason)
         return
-    unbalanced = "" if is_ours(task) else unbalanced_energy(task)
+    unbalanced = "" if is_built_in(task) else unbalanced_energy(task)
     for integrator in task.integrators:
         for outcome in balances(task, integrator, quick, unbalanced):
             yield (

@@ -28,7 +28,7 @@ THREADS = {"1 thread": 1, "2 threads": 2}
 
 
 def commands(model: mujoco.MjModel, steps: int, seed: int) -> np.ndarray:
-    """Return random controls, shape (steps, nu), in their ranges or +-1, held for five steps."""
+    """Return random controls, shape (steps, nu), held for five steps, in their ranges or +-1."""
     limited = model.actuator_ctrllimited.astype(bool)
     low = np.where(limited, model.actuator_ctrlrange[:, 0], -1.0)
     high = np.where(limited, model.actuator_ctrlrange[:, 1], 1.0)
@@ -105,7 +105,7 @@ def copied_and_restored(
 ) -> Iterator[tuple[Case, ...]]:
     """Compare a copied `MjData`, and one restored from a state vector, with the original.
 
-    Both are made halfway through a run, whose second half is then simulated with each.
+    Both are created halfway through a run, and each then simulates the second half.
     """
 
     def restored(original: mujoco.MjData) -> mujoco.MjData:
@@ -129,7 +129,7 @@ def copied_and_restored(
 def forward_passes(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
     """Check that three forward passes between steps leave the motors' states as one pass does.
 
-    These are the activations and the states of plugins.
+    The motors' states are the activations and the states of plugins.
     """
     inputs, motor_start = commands(model, steps, seed=2), 1 + model.nq + model.nv
     data = mujoco.MjData(model)
@@ -157,11 +157,11 @@ def model_checks(
     yield from forward_passes(model, steps)
 
 
-# -- with a task's bounds and integrator around it -------------------------------------------------
+# -- a task with its bounds and its integrator -----------------------------------------------------
 
 
 def _episode(physics: MujocoPhysics, forces: np.ndarray, inspect: bool = False) -> np.ndarray:
-    """Return mechanical and motor states after each step, with a forward pass between if `look`."""
+    """Return mechanical and motor states after each step, with forward passes if `inspect`."""
     states = []
     for force in forces:
         physics.step(force)
@@ -196,7 +196,7 @@ def _simulation(
 def repeated(task: Task, integrator: str, steps: int) -> Iterator[tuple[Case, ...]]:
     """Compare a simulation pickled halfway, and episodes after a reset, with the original.
 
-    In the last episode a forward pass follows every step, as viewers do it.
+    In the last episode a forward pass follows every step, as in a viewer.
     """
     physics, _, forces = _simulation(task, integrator, 3, 2 * steps)
     _episode(physics, forces[:steps])

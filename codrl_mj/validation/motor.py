@@ -1,24 +1,24 @@
 """Comparison of the motor as it runs inside MuJoCo, callbacks included, with independent oracles.
 
-This module has the motor without its loop, driven by a voltage, against MuJoCo's native
+This module compares the motor without its loop, driven by a voltage, with MuJoCo's native
 `<dcmotor>`, gym-electric-motor and a datasheet. `motor_loops` compares the current loop with linear
 systems theory, `own_model` has the checks that apply to any family of actuators, and
 `motor_catalogue` compares off-the-shelf motors. Torques are read where the engine applies them.
 
 MuJoCo's motor integrates the winding differently. With the speed held over a step, the native motor
-is exact, i' = i_inf + (i - i_inf) exp(-R dt/L), and our motor takes Euler steps. Hence two
-comparisons: at an inductance of R dt/(1 - exp(-R dt/L)) one Euler step *is* the exact one, so that
-the two motors must be equal to rounding; and at the true inductance our motor converges to the
-native one at first order in the substeps.
+is exact, i' = i_inf + (i - i_inf) exp(-R dt/L), and our motor takes Euler steps. There are
+therefore two comparisons: at an inductance of R dt/(1 - exp(-R dt/L)) one Euler step *is* the exact
+one, so that the two motors must be equal to rounding; and at the true inductance our motor
+converges to the native one at first order in the substeps.
 
 Under `implicitfast` the engine adds the slope of the native motor's torque over speed, kT kE/R (1 -
-exp(-R dt/L)), to the velocity's implicit matrix. Our motor has no such slope. It shrinks with the
-step and acts over a step, so that the difference vanishes at second order; on a locked rotor there
-is none.
+exp(-R dt/L)), to the velocity's implicit matrix. Our motor has no such slope. The slope shrinks
+with the step and acts for one step, so that the difference vanishes at second order. On a locked
+rotor there is no difference.
 
-Under RK4 the native motor is no oracle: the engine advances its current at every stage, and the
-current at the end of a step lies on no exponential. `rk4_check` measures it beside our motor, which
-holds the force over the step and stays exact.
+Under RK4 the native motor is no oracle: the engine advances its current at every stage, so that the
+current at the end of a step is not on the exponential. `rk4_check` reports its error beside that of
+our motor, which holds the force over the step and stays exact.
 
 gym-electric-motor (https://github.com/upb-lea/gym-electric-motor) is a third-party simulator of
 electric drives. It is not a dependency of the package, because it installs pytest and coverage; its
@@ -68,7 +68,7 @@ MOTORS: dict[str, Motor] = {
     "paper": Motor(),
     "small": Motor(resistance=2.0, inductance=0.02, torque_constant=0.5, back_emf_constant=0.5),
 }
-"""Motors that are compared: the paper's, and one whose parameters all differ from each other."""
+"""Motors that are compared: the paper's, most of whose parameters are 1, and a smaller one."""
 
 _NATIVE_CASES: tuple[tuple[Rotor, str], ...] = (
     (LOCKED_ROTOR, "Euler"),
@@ -410,9 +410,9 @@ def no_load(motors: Mapping[str, Motor]) -> Iterator[Case]:
 def voltage_limit(loops: Mapping[str, Loop]) -> Iterator[Case]:
     """Compare the stall torque at the voltage limit of controller and supply, in both directions.
 
-    The command is 1000 times the stall torque, so that the loop saturates whatever its gains and
-    the torque must be kT*u_max/R. Loops without a limit, or without a gain, never saturate and are
-    skipped. The tolerance is that of the other constants.
+    The command is 1000 times the stall torque, so that any loop saturates, and the torque
+    must be kT*u_max/R. Loops without a limit, or without a gain, never saturate and are
+    skipped. The tolerance is that of the other datasheet checks.
     """
     for name, loop in loops.items():
         motor, gains, supply = loop.actuator.motor, loop.actuator.controller, loop.actuator.supply

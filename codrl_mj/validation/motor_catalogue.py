@@ -4,7 +4,7 @@ Gymnasium's environments have no rotor inertia, gear or friction on the joint. B
 equations are linear in the force, these can be added from outside: with a_0 the joint's
 acceleration under no force and w its slope over the force, an inertia A, a damping D and a friction
 f make it a = a_0 + w (F + f - D v - A a), so that the unmodified environment under the force in
-brackets moves as the joint with the rotor does. MuJoCo's Euler takes the damping at the new speed:
+parentheses moves like the joint with the rotor. MuJoCo's Euler takes the damping at the new speed:
 A + h D replaces A. Friction follows MuJoCo's documentation (Computation, "Friction loss"; Modeling,
 "Solver parameters"), which for one joint is a closed form.
 
@@ -67,7 +67,7 @@ class DriveOracle:
     """
 
     def __init__(self, actuator: Drive, timestep: float) -> None:
-        """Start at rest; timestep: mechanical [s]."""
+        """Start at rest, with the timestep of the mechanics [s]."""
         motor, sample = actuator.motor, 1.0 / actuator.controller.sample_rate
         self._motor, self._timestep = motor, timestep
         self._voltage, self._max_current = actuator.voltage_limit, actuator.controller.max_current
@@ -124,7 +124,7 @@ class JointOracle:
     """Gymnasium's environment of a task, with the inertia, damping and friction of a drive."""
 
     def __init__(self, task: Task, actuator: Drive, timestep: float, integrator: str) -> None:
-        """Prepare a task with a reference environment and one motor; timestep: integration [s]."""
+        """Prepare a task with a reference environment and one motor; `timestep` is in seconds."""
         motor, arm = actuator.motor, actuator.motor.arm_radius / actuator.motor.gear_ratio
         self._armature, self._damping = (
             motor.rotor_inertia / arm**2,
@@ -150,7 +150,7 @@ class JointOracle:
         return float(free), float(self._equations(state, 1.0)[self._speed_index] - free)
 
     def _force(self, state: np.ndarray, force: float) -> float:
-        """Return the force that moves the plain environment as `force` moves joint and rotor."""
+        """Return the force that moves the environment as `force` moves the joint with the rotor."""
         (free, slope), speed = self._linear(state), float(state[self._speed_index])
         force -= self._damping * speed
         smooth = (free + slope * force) / (1.0 + self._armature * slope)
@@ -177,10 +177,12 @@ class JointOracle:
         return np.array(self._task.constrain(after, self._timestep))
 
 
-_TWIN = "Gymnasium {task.gymnasium_id} with a rotor on its joint, the winding by scipy.linalg.expm"
+_ORACLE = (
+    "Gymnasium {task.gymnasium_id} with a rotor on its joint, the winding by scipy.linalg.expm"
+)
 
 
-@check("trajectories", Check("run, {integrator}, {motor}", _TWIN, 1e-9))
+@check("trajectories", Check("run, {integrator}, {motor}", _ORACLE, 1e-9))
 def task_motor_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
     """Compare a task's run with its drive of `TASK_MOTORS`, under random bang-bang commands."""
     actuator, generator = task_drive(task.name), np.random.default_rng(0)

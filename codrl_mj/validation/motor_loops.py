@@ -34,22 +34,22 @@ def closed_form(
     """Return the joint torque [N*m] of the analog loop after each step [s], by matrix exponential.
 
     L di/dt = u - kE*omega - R*i,  u = kP*e + kI*I + kD*D + kFF*i_ref (+ kE*omega),  dI/dt = e -
-    leak*I; with a filter D = (e - y)/Td and dy/dt = D; without one D = de/dt, which adds kD to L,
-    and a step of i_ref makes the current jump by kD/(L + kD) of it. The voltage has no limit;
-    desired torques [N*m] are held over each step, the joint keeps its speed [rad/s], and the loop
-    starts at rest.
+    leak*I; with a filter D = (e - y)/Td and dy/dt = D. Without a filter D = de/dt, which adds kD to
+    L, so that a step of i_ref makes the current jump by kD/(L + kD) of the step. The voltage has no
+    limit; desired torques [N*m] are held over each step, the joint keeps its speed [rad/s], and the
+    loop starts at rest.
     """
     motor, loop = actuator.motor, actuator.controller
     filtered = loop.derivative_time_constant > 0
     derivative = loop.kd / loop.derivative_time_constant if filtered else 0.0
-    inertia = motor.inductance + (0.0 if filtered else loop.kd)
+    effective_inductance = motor.inductance + (0.0 if filtered else loop.kd)
     relaxation = 1 / loop.derivative_time_constant if filtered else 0.0
     voltage = 0.0 if loop.bemf_compensation else -motor.back_emf_constant * speed / motor.arm_radius
     feedback = loop.kp + derivative
     # The columns are current, integral, filtered error, reference and the constant 1.
     system = np.zeros((5, 5))
     system[0] = [-motor.resistance - feedback, loop.ki, -derivative, feedback + loop.kff, voltage]
-    system[0] /= inertia
+    system[0] /= effective_inductance
     system[1] = [-1.0, -loop.integral_leak, 0.0, 1.0, 0.0]
     system[2] = [-relaxation, 0.0, -relaxation, relaxation, 0.0]
     advance = linalg.expm(system * timestep)
@@ -74,7 +74,7 @@ _ORACLE = "matrix exponential of the RL circuit under the analogue PID (scipy.li
 def order_to_closed_form(loops: Mapping[str, Loop], quick: bool) -> Iterator[tuple[Case, ...]]:
     """Check that the loop converges to the closed form at first order in the substeps.
 
-    The second row of results is the limit itself, by extrapolation.
+    The second row of results is the extrapolated limit of small substeps.
 
     The limit is Richardson's 2 x(2N) - x(N), whose error is of second order: below 1e-5 of the
     desired 1 N m at the finest substep, 1/100 or less of every time constant here. A parameter off
@@ -173,8 +173,8 @@ def closed_loop(actuator: DCMotorActuator, timestep: float) -> Any:
     """Return python-control's discrete system from desired torque to torque at the step's start.
 
     The torque is kT times the current; the sampling period is `timestep`.
-    The winding is python-control's forward-Euler sampling of 1/(L s + R), the integral its
-    backward-difference sampling of 1/(s + leak), both as Algorithm 1 has them. The blocks are
+    As in Algorithm 1, the winding is 1/(L s + R) sampled by forward Euler, and the integral is
+    1/(s + leak) sampled by backward differences. The blocks are
     joined as state-space systems: transfer functions of poles close to 1 lose digits when their
     polynomials are multiplied.
     """

@@ -28,7 +28,7 @@ from codrl_mj.physics import MujocoPhysics, compiled_task, mjcf
 from codrl_mj.physics.variation import bare_model
 from codrl_mj.tasks import PAPER_TASKS, find_task
 from codrl_mj.validation.certificate import (
-    WITHOUT_TASK,
+    TASK_INDEPENDENT,
     Certificate,
     Progress,
     ignore_progress,
@@ -108,7 +108,7 @@ def compile_edited(module: types.ModuleType, edits: Sequence[Edit]) -> types.Mod
 
 
 _HIDDEN = np.zeros(64)
-"""Memory that all simulations share, one number for each actuator of a model."""
+"""Memory that a fault shares between all simulations, a number for each actuator of a model."""
 
 
 @cache
@@ -432,7 +432,7 @@ def try_mutations(
             continue
         with mutation.apply(), _quiet():
             certificate = validate(affected, quick=True, groups=mutation.groups)
-        for task in ([""] if set(WITHOUT_TASK) & set(mutation.groups) else []) + affected:
+        for task in ([""] if set(TASK_INDEPENDENT) & set(mutation.groups) else []) + affected:
             checks = [check for check in certificate.checks if check.task == task]
             failed = tuple(check for check in checks if not check.passed)
             results.append(MutationResult(mutation.name, task, failed, len(checks)))
@@ -441,7 +441,7 @@ def try_mutations(
 
 
 def as_mapping(certificate: Certificate, results: Sequence[MutationResult]) -> dict[str, Any]:
-    """Return the results of the faults for JSON, beside the certificate's; empty without faults."""
+    """Return the results of the faults as JSON-serializable values; empty without faults."""
     rows: list[dict[str, Any]] = []
     for result in results:
         row: dict[str, Any] = {

@@ -1,8 +1,8 @@
 """Checks of any model with codrl_mj motors, through the callbacks or the plugin.
 
 Actuators of any family run inside the engine and, for comparison, as the same functions in plain
-Python. A function of floats must have the same result in both: `compiled_checks` tolerates no
-difference of a bit.
+Python. A function of floats must have the same result in both, so `compiled_checks` does not
+tolerate a difference of a single bit.
 """
 
 import copy
@@ -301,7 +301,7 @@ EXAMPLES: tuple[ActuatorModel, ...] = (
 def compiled_checks(quick: bool) -> Iterator[Check]:
     """Compare `advance` of every family with plain Python, on swinging rotors under random torques.
 
-    The families behind other commands, such as voltage, are included.
+    Families that only serve commands other than the force, such as a voltage, are included.
     """
     examples = {type(actuator): actuator for actuator in EXAMPLES}
     registered = [

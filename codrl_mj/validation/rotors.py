@@ -109,7 +109,7 @@ def simulate(
     """Simulate a model of `build_rotors` from rest and record it.
 
     Args:
-        model: a model whose motors all have a current.
+        model: a model in which every motor has a current.
         controls: controls, shape (steps,) for all motors or (steps, motors).
         speeds: joint speeds [rad/s], shape (steps,) or (steps, motors), set before each step; None
             leaves them to the engine.

@@ -1,6 +1,6 @@
 """Table of all checks, and the decorator that evaluates them.
 
-A check is a generator function that yields the compared cases and makes no verdict. The decorator
+A check is a generator function that yields the compared cases without judging them. The decorator
 `check` enters its rows in `TABLE` and turns it into a function that returns these rows with the
 worst case, its description and the plots.
 """
@@ -89,9 +89,9 @@ class Skipped:
     reason: str
     """Reason why the check does not apply, or a missing requirement."""
     group: str = ""
-    """Part of the certificate, which the certificate fills in."""
+    """Group of checks; the certificate fills it in."""
     task: str = ""
-    """Task or model, which the certificate fills in."""
+    """Task or model; the certificate fills it in."""
 
 
 def order_check(name: str, oracle: str) -> Check:
@@ -126,8 +126,8 @@ def check(group: str, *rows: Check) -> Callable[[Callable[..., Cases]], Callable
     yields nothing, there are no results. Fields in braces in the rows are filled in by its
     arguments and by further keyword arguments of the call.
     """
-    of_group = [dataclasses.replace(row, group=group) for row in rows]
-    TABLE.extend(of_group)
+    group_rows = [dataclasses.replace(row, group=group) for row in rows]
+    TABLE.extend(group_rows)
 
     def register(cases: Callable[..., Cases]) -> Callable[..., list[Check]]:
         signature = inspect.signature(cases)
@@ -149,7 +149,7 @@ def check(group: str, *rows: Check) -> Callable[[Callable[..., Cases]], Callable
             cases_by_row = zip(*case_tuples, strict=True)
             return [
                 evaluate_cases(row, fields, row_cases)
-                for row, row_cases in zip(of_group, cases_by_row, strict=bool(case_tuples))
+                for row, row_cases in zip(group_rows, cases_by_row, strict=bool(case_tuples))
             ]
 
         return run_check
@@ -160,8 +160,8 @@ def check(group: str, *rows: Check) -> Callable[[Callable[..., Cases]], Callable
 def evaluate_cases(row: Check, fields: dict[str, Any], cases: Iterable[Case]) -> Check:
     """Return a row with the result of its cases.
 
-    The worst case is the largest difference, the first one of equals; a NaN is larger than
-    anything.
+    The worst case has the largest difference; of equal ones it is the first. A NaN is larger than
+    any number.
     """
     worst, description, samples = -math.inf, "", 0
     plots: list[Plot] = []
@@ -224,14 +224,16 @@ class ConvergenceSeries(NamedTuple):
     errors: np.ndarray
     """Error at each step."""
     rounding: float = 0.0
-    """Size up to which an error is rounding, and shows no order."""
+    """Size up to which an error is only rounding and shows no order."""
 
     def distance_from(self, promised: float) -> tuple[float, str]:
         """Return the distance from the promised order, and its description.
 
-        Errors that are rounding are left out. If fewer than three errors remain, there is no slope.
-        Then the largest error may be twice the rounding, times the growth of an error of the
-        promised order over two steps; the distance is `ORDER_TOLERANCE` times the ratio to that.
+        Errors that are only rounding are left out. If fewer than three errors remain, there is no
+        slope, and the largest error is compared with an allowance instead: twice the rounding,
+        times the factor by which an error of the promised order grows from the third step size to
+        the first. The distance is then `ORDER_TOLERANCE` times the largest error over this
+        allowance.
         """
         # A NaN compares false and therefore stays in, so that it fails the check.
         clear = ~(self.errors <= self.rounding) | (self.rounding == 0.0)

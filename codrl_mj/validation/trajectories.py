@@ -1,8 +1,8 @@
 """Comparison of whole runs in MuJoCo with Gymnasium under the same commands.
 
-In MuJoCo the motor runs in the callback, beside Gymnasium in plain Python. A run is checked twice.
-Up to the horizon of `Task.reference_states` the difference itself must stay below 1e-9. Over a
-whole episode a chaotic task enlarges even the smallest rounding beyond any fixed bound. There the
+In MuJoCo the motor runs in the callback; for Gymnasium it runs in plain Python. A run is checked
+twice. Up to the horizon of `Task.reference_states` the difference itself must stay below 1e-9. Over
+a whole episode a chaotic task enlarges even the smallest rounding beyond any fixed bound. There the
 difference is divided by the growth of rounding errors in the oracle along the same run (`Growth`),
 which separates the port's error from its amplification by chaos.
 """
@@ -27,10 +27,11 @@ TOLERANCE = 1e-9
 It allows for rounding (1e-16), a thousand steps, and the error growth of tasks that are not
 chaotic.
 """
-ROUNDINGS = 30.0
+MAX_ROUNDINGS = 30.0
 """Largest difference over a whole run, in standard deviations of the oracle's accumulated rounding.
 
-The rounding is 2e-16 for each entry and step; a step rounds some tens of numbers.
+The oracle is assumed to round each entry by 2e-16 in each step; a real step rounds some tens of
+numbers.
 """
 
 UNLIMITED_STEPS = 200
@@ -41,15 +42,15 @@ ACTUATORS = ("ideal", "paper", "weaker", STARVED)
 """Names of the actuators that are compared."""
 
 
-APART = 1e-7
-"""Displacement of finite differences, relative to max(1, size).
+DISPLACEMENT = 1e-7
+"""Displacement of a state entry for finite differences, relative to max(1, size).
 
 It is far above rounding, and small enough for the step to be linear in it.
 """
 ROUNDING = float(np.finfo(float).eps)
 """Rounding error of a double, relative."""
-CLOCK = 2
-"""Number of entries behind the states in a snapshot of `AnalyticPhysics`: time and key."""
+NUM_CLOCK_ENTRIES = 2
+"""Number of entries after the states in a snapshot of `AnalyticPhysics`: time and key."""
 
 
 class Growth:
@@ -71,7 +72,7 @@ class Growth:
         self._displaced_run = copy.deepcopy(run)
         self._size = len(task.state_names)
         self._start = run.snapshot()
-        entries = len(self._start) - CLOCK
+        entries = len(self._start) - NUM_CLOCK_ENTRIES
         direction = np.random.default_rng(seed).standard_normal(entries)
         self._direction = direction / np.linalg.norm(direction)
         self._covariance = np.zeros((entries, entries))
@@ -86,7 +87,7 @@ class Growth:
         end = self._run.snapshot()
         matrix = np.empty((entries, entries))
         for entry in range(entries):
-            displacement = APART * max(1.0, abs(self._start[entry]))
+            displacement = DISPLACEMENT * max(1.0, abs(self._start[entry]))
             displaced = self._start.copy()
             displaced[entry] += displacement
             displaced_run.restore(displaced)
@@ -164,7 +165,12 @@ def _plot(task: Task, gaps: np.ndarray, growth: Growth, title: str) -> Plot:
             ROUNDING * np.exp(exponent * times),
             reference=True,
         ),
-        Curve(f"allowed: {ROUNDINGS:g} × rounding", times, ROUNDINGS * rounding, reference=True),
+        Curve(
+            f"allowed: {MAX_ROUNDINGS:g} × rounding",
+            times,
+            MAX_ROUNDINGS * rounding,
+            reference=True,
+        ),
     )
     return Plot(title, "time [s]", "difference [relative]", curves, y_log=True)
 
@@ -175,7 +181,7 @@ _NAME, _ORACLE = "{integrator}, {actuator_name} actuator", "{task.oracle}{motor}
 @check(
     "trajectories",
     Check(f"run, {_NAME}", _ORACLE, TOLERANCE),
-    Check(f"run against rounding, {_NAME}", _ORACLE, ROUNDINGS, "accumulated roundings"),
+    Check(f"run against rounding, {_NAME}", _ORACLE, MAX_ROUNDINGS, "accumulated roundings"),
 )
 def whole_runs(
     task: Task, actuator_name: str, integrator: str, seeds: range, max_steps: int

@@ -221,7 +221,7 @@ def test_bridge_rounds_the_voltages_of_a_policy_that_commands_them(tmp_path, tas
     commanded = contract.to_commands(result.on_board[0].action).ravel() / step
     np.testing.assert_allclose(coarse, np.round(commanded), atol=1e-6)
     with pytest.raises(
-        ValueError, match="the policy commands voltages, and the C measures no current"
+        ValueError, match="the policy commands voltages, and the C code measures no current"
     ):
         board_test(tmp_path / "out", episodes=1, link=Link(pwm_bits=8, current_bits=8))
 
@@ -231,7 +231,8 @@ def test_raises_for_pwm_bits_without_a_loop_or_a_voltage(tmp_path):
         trained("pendulum", "ddpg")[0], EnvConfig("pendulum", "lag"), "ddpg", tmp_path / "out", 1
     )
     with pytest.raises(
-        ValueError, match="must be 0: the C neither closes a current loop nor commands a voltage"
+        ValueError,
+        match="must be 0: the C code neither closes a current loop nor commands a voltage",
     ):
         board_test(tmp_path / "out", episodes=1, link=Link(pwm_bits=8))
 

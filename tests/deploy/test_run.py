@@ -160,7 +160,7 @@ def test_second_run_does_not_drive_with_the_command_of_the_first(folder, port, t
     assert run_board(folder, board, tmp_path / "first.csv", seconds=0.5).reason == "requested"
     # Without a watchdog, the board takes the second run's stamps for old.
     second = run_board(folder, board, tmp_path / "again.csv", drive=True, seconds=5.0)
-    assert "took a frame for old" in second.reason
+    assert "refused a frame as old" in second.reason
     _, rows = table_of(tmp_path / "again.csv")
     # This column has the commands that the drive got.
     assert not rows[:, 8].any()

@@ -1,8 +1,9 @@
 """Presets: settings of an agent for a task.
 
-They are ours (`default`, `fast`), the paper's (`paper`), and the paper's with repairs (`repaired`).
-Each agent has a TOML file in this folder, with a table of the fields of `Preset` for each task and
-name. In it `"none"` means None, and `like` names the settings above from which the table starts.
+The presets are ours (`default`, `fast`), the paper's (`paper`), and the paper's with repairs
+(`repaired`). Each agent has a TOML file in this folder, with a table of the fields of `Preset` for
+each task and name. In a table, `"none"` means None, and `like` names earlier settings of the same
+task, from which the table starts.
 docs/agents.md has the results of training and tests.
 """
 
@@ -67,7 +68,7 @@ PRESETS: dict[tuple[str, str], dict[str, Preset]] = {
 
 
 def find_preset(agent: str, task: str, settings: str = "default") -> Preset:
-    """Return the preset of a name for an agent on a task.
+    """Return the preset of an agent on a task, by the name of its settings.
 
     A custom agent, or a custom task, has the agent's default settings as `default`.
 

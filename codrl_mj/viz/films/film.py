@@ -55,7 +55,8 @@ class FrameRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
 
         Args:
             env: the environment, with `render_mode="rgb_array"`.
-            pretty: render shadows and multisampling, which cost ten times the rest on a CPU.
+            pretty: render shadows and multisampling, which on a CPU take ten times as long as the
+                rest.
         """
         if env.render_mode != "rgb_array":
             raise ValueError(f"render_mode = {env.render_mode!r}: must be 'rgb_array' for a film")
@@ -113,7 +114,7 @@ def record(
     camera: str = "fixed",
     pretty: bool = False,
 ) -> Panel:
-    """Run an episode in an `EnvConfig`, to be filmed in images of a size [px].
+    """Run an episode in an `EnvConfig`, and record what a film of it needs.
 
     Third-party environments store their images while they run, and the camera `fixed` selects their
     default camera. Tasks are rendered later from their states.
@@ -254,7 +255,7 @@ class Clip(NamedTuple):
 
 
 def clip(panel: Panel, width: int, height: int) -> Clip:
-    """Return the scene of an episode as a film in memory, of even sizes [px].
+    """Return the scene of an episode as a film in memory; width and height [px] must be even.
 
     Raises:
         RenderingUnavailableError: no OpenGL context can be created; the message names a remedy.
@@ -270,7 +271,7 @@ def clip(panel: Panel, width: int, height: int) -> Clip:
         with _encoding(path, rate, _PAGE_ENCODING) as add:
             for index, instant in enumerate(instants):
                 image = draw(instant)
-                # The still picture is taken a third into the episode, where more is going on than
+                # The still picture is taken after a third of the episode, where more happens than
                 # at its start.
                 if index == len(instants) // 3:
                     Image.fromarray(image).save(still, "jpeg", quality=85)

@@ -358,7 +358,7 @@ def small_step_plots(loops: Loops) -> list[Plot]:
 
 
 def recovery_plots(drive: Drive, steps: StepResponses) -> list[Plot]:
-    """Return the recovery from an unreachable reference for each anti-windup, and a close-up."""
+    """Return recoveries from an unreachable reference by kind of anti-windup, and a close-up."""
     responses = {}
     for kind, response in steps.recoveries.items():
         recovery_time = response.settling_time(0.05)

@@ -27,7 +27,7 @@ _MAX_STATES = 12
 
 
 class RunEpisode(NamedTuple):
-    """A run with an episode, as far as one could be run."""
+    """A run with its episode, if an episode could be run."""
 
     name: str
     """Name of the run."""
@@ -77,6 +77,7 @@ class _MotorSeries(MotorTrace):
     color_index: int | None
     """Index of the motor among those of all runs, for its color; None for a single motor."""
     tags: tuple[str, ...]
+    """Owners of the curves: the run and the motor."""
     stride: int
     """Number of integration steps per drawn point."""
 
@@ -247,7 +248,7 @@ def _motor_plots(lines: Sequence[_MotorSeries]) -> list[Plot]:
         torque.append(line.curve("actual", line.actual, 1))
         if line.is_torque_controlled:
             torque.append(line.curve("desired", line.desired, 0, dashed=True))
-            error.append(line.curve("desired less actual", line.desired - line.actual, 4))
+            error.append(line.curve("desired minus actual", line.desired - line.actual, 4))
         if line.has("current"):
             current.append(line.curve("current", line.signals["current"], 1, held=False))
         if line.has("current", "reference_current"):
@@ -274,7 +275,7 @@ def _motor_plots(lines: Sequence[_MotorSeries]) -> list[Plot]:
         Plot(title, _TIME, unit, tuple(torque), clock=True, shades=_shades(lines, "saturated"))
     ]
     if any(np.ptp(curve.y) > 0.0 or curve.y.any() for curve in error):
-        plots.append(Plot("Error: desired less actual", _TIME, unit, tuple(error), clock=True))
+        plots.append(Plot("Error: desired minus actual", _TIME, unit, tuple(error), clock=True))
     if current:
         shades = _shades(lines, "current_saturated", "temperature_saturated")
         plots.append(

@@ -143,10 +143,10 @@ def _parameters(result: Identified) -> Markup:
 def _advice(result: Identified) -> Markup:
     texts = [
         Markup("<b>{}</b> is {}: {}.").format(
-            name.name.replace("_", " "), name.status, _ADVICE[name.name]
+            estimate.name.replace("_", " "), estimate.status, _ADVICE[estimate.name]
         )
-        for name in result.estimates
-        if name.status not in ("identified", "given") and name.name in _ADVICE
+        for estimate in result.estimates
+        if estimate.status not in ("identified", "given") and estimate.name in _ADVICE
     ]
     pair_text = Markup(
         "<b>{}</b> and <b>{}</b> cannot be separated (correlation {:+.2f}): give one of them with"
@@ -209,9 +209,9 @@ def _errors(result: Identified) -> Markup:
 
 
 def _fit_plots(trace: Trace) -> Markup:
-    """Return plots of measurement and simulation of a log, residuals and their autocorrelation.
+    """Return plots of a log and its simulation, of the residuals and of their autocorrelation.
 
-    Noise has a small autocorrelation.
+    The residuals of a good fit are noise, whose autocorrelation is small.
     """
     from scipy.signal import correlate
 
@@ -250,7 +250,7 @@ def _fit_plots(trace: Trace) -> Markup:
             Plot(
                 f"{label}, residuals",
                 "time [s]",
-                f"measured less simulated [{unit}]",
+                f"measured minus simulated [{unit}]",
                 (residual_curve,),
             ),
             Plot(
@@ -269,10 +269,10 @@ def _correlations(result: Identified) -> Markup:
                 [
                     Markup(
                         "<b>{:+.2f}</b>"
-                        if _STRONG_CORRELATION <= abs(share) < 1.0 - 1e-9
+                        if _STRONG_CORRELATION <= abs(correlation) < 1.0 - 1e-9
                         else "{:+.2f}"
-                    ).format(share)
-                    for share in row
+                    ).format(correlation)
+                    for correlation in row
                 ]
                 for row in (row.values() for row in table.values())
             ]

@@ -51,7 +51,7 @@ def _template(name: str) -> jinja2.Template:
 
 
 def render_part(name: str, *arguments: Any) -> Markup:
-    """Return a macro of `parts.html.jinja`, which documents its arguments, filled in."""
+    """Render a macro of `parts.html.jinja`, where its arguments are documented."""
     return Markup(getattr(_template("parts.html.jinja").module, name)(*arguments))
 
 
@@ -96,7 +96,7 @@ def write(path: Path, text: str) -> Path:
 
 
 def join(parts: Iterable[Any]) -> Markup:
-    """Return parts one after the other; those that are no markup are escaped."""
+    """Return parts one after the other; parts that are not markup are escaped."""
     return Markup().join(parts)
 
 
@@ -157,7 +157,7 @@ def table(
 
 
 def plot(content: Plot, low: bool = False) -> Markup:
-    """Return a plot as markup; a `low` one is less high."""
+    """Return a plot as markup; `low` reduces its height."""
     # Without JavaScript the page shows this picture instead of the interactive plot.
     picture = _data_url(to_svg(content, height=2.2 if low else 3.2).encode(), "image/svg+xml")
     axes = f"{content.y_label} over {content.x_label}" if content.clock else content.y_label

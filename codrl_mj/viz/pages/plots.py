@@ -49,9 +49,10 @@ class Curve:
     filled: bool = False
     """True to fill the area to the previous curve, which has the same x."""
     tags: tuple[str, ...] = ()
-    """Owners of the curve, such as a run and a motor. The curve is hidden with any of them."""
+    """Owners of the curve, such as a run and a motor. The curve is hidden if one of them is."""
     times: np.ndarray | None = None
-    """Times of a trail's points on the page's clock [s], shape (n,). The present point is marked.
+    """Times of a trail's points on the page's clock [s], shape (n,). The point at the
+    current time is marked.
     """
 
 
@@ -173,14 +174,14 @@ def to_json(plot: Plot) -> str:
 
 
 def _finite_or_nan(values: np.ndarray, log: bool) -> np.ndarray:
-    """Return the values with NaN, which is drawn as a gap, for those that cannot be drawn."""
+    """Return the values, with NaN, which is drawn as a gap, in place of undrawable ones."""
     values = np.asarray(values, dtype=float)
     is_drawable = np.isfinite(values) & (np.abs(values) < 3e38) & (values > 1e-37 if log else True)
     return np.where(is_drawable, values, np.nan)
 
 
 def _ceiling(plot: Plot) -> float | None:
-    """Return the top of a logarithmic axis, 1e6 times the largest result, if there are references.
+    """Return the top of a logarithmic axis with references: 1e6 times the largest result.
 
     Reference curves may leave the picture, results may not.
     """

@@ -49,7 +49,7 @@ def report(
     extra_parts: Callable[[Sequence[RunEpisode]], Sequence[Markup]] = lambda _: (),
     on_part: Callable[[str], None] = lambda _: None,
 ) -> Path:
-    """Write a report.
+    """Write a report as one HTML page.
 
     Args:
         runs: run folders, at least one; also unfinished and damaged ones.
@@ -69,8 +69,8 @@ def report(
         `out`.
 
     Raises:
-        FileNotFoundError: a folder is no run folder, or the certificate does not exist.
-        ValueError: no run, a seed below 0, `out` is no .html file, or the given certificate is
+        FileNotFoundError: a folder is not a run folder, or the certificate does not exist.
+        ValueError: no run, a seed below 0, `out` is not an .html file, or the given certificate is
             damaged.
     """
     if not runs:
@@ -121,7 +121,7 @@ def _run_episode(
     summary: RunSummary,
     name: str,
     which: str,
-    seed_given: int | None,
+    requested_seed: int | None,
     trust: bool,
     with_film: bool,
     on_part: Callable[[str], None],
@@ -129,7 +129,7 @@ def _run_episode(
     """Return a run with an episode, if it can be run."""
     best = which == "best" or not finished(summary.path)
     evaluation = read_evaluation(summary.path, best)
-    seed = seed_given if seed_given is not None else median_seed(evaluation) or 0
+    seed = requested_seed if requested_seed is not None else median_seed(evaluation) or 0
     try:
         config = load_config(summary.path, trust)
     except (ValueError, OSError, ImportError) as error:
@@ -237,7 +237,7 @@ def _task_summary(task: str) -> str:
 def _learning(runs: Sequence[RunEpisode]) -> Markup:
     """Return learning curves from the runs' tables.
 
-    Beside other runs, each run has one color and no dots.
+    With several runs, each run has one color and no dots.
     """
     notes: list[Markup] = []
     returns: list[Curve] = []
@@ -251,7 +251,7 @@ def _learning(runs: Sequence[RunEpisode]) -> Markup:
         ]
         try:
             steps, evaluated, torque_errors = np.array(columns, dtype=np.float64)
-        # A damaged table has a cell that is no number.
+        # A damaged table has a cell that is not a number.
         except ValueError:
             steps, evaluated, torque_errors = np.empty((3, 0))
         try:
@@ -437,7 +437,7 @@ def _loop(runs: Sequence[RunEpisode]) -> Markup:
 def _step_torque(actuator: ActuatorModel, episode: Episode) -> float:
     """Return half of the largest desired torque of an actuator in an episode [N*m].
 
-    If the actuator was randomized, that is the largest over all motors.
+    If no motor of the episode has this actuator, because it was randomized, all motors count.
     """
     forces = np.atleast_2d(np.abs(np.asarray(episode.signals["desired_force"], dtype=float)).T)
     actuators = episode.actuator if isinstance(episode.actuator, tuple) else (episode.actuator,)
@@ -445,17 +445,19 @@ def _step_torque(actuator: ActuatorModel, episode: Episode) -> float:
     return 0.5 * actuator.arm_radius * float(forces[is_own if any(is_own) else slice(None)].max())
 
 
-def _certificate(runs: Sequence[Path], path_given: Path | None) -> Markup:
+def _certificate(runs: Sequence[Path], requested_path: Path | None) -> Markup:
     """Return a summary of the certificate, if there is one."""
     paths = [file for path in runs if (file := path / certificates.JSON_NAME).is_file()]
-    if path_given is not None:
-        paths = [path_given / certificates.JSON_NAME if path_given.is_dir() else path_given]
+    if requested_path is not None:
+        paths = [
+            requested_path / certificates.JSON_NAME if requested_path.is_dir() else requested_path
+        ]
     for file in paths[:1]:
         try:
             return certificates.summary(read_json(file, "certificate"))
         except (KeyError, TypeError, ValueError) as error:
-            problem = f"{file} is no certificate: {type(error).__name__}: {error}"
-            if path_given is not None:
+            problem = f"{file} is not a certificate: {type(error).__name__}: {error}"
+            if requested_path is not None:
                 raise ValueError(problem) from None
             return page.note(problem, bad=True)
     return Markup()

@@ -1,4 +1,4 @@
-"""Motion of a model's bodies, and its replay as a part of a page or a self-contained page."""
+"""Motion of a model's bodies, and its replay on a page of its own or as a part of a page."""
 
 import base64
 import dataclasses
@@ -35,7 +35,7 @@ SCRIPT = "const setTime = codrlReplay(element);"
 clock but never moves it.
 """
 _MAX_RATE = 30
-"""Maximum number of stored instants per second. The viewer interpolates between them."""
+"""Maximum number of stored instants per second, between which the viewer interpolates."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +67,7 @@ def motion(
     camera: str | None = None,
     show: Callable[[np.ndarray], mujoco.MjData] | None = None,
 ) -> Motion:
-    """Return the motion of any model.
+    """Return the motion of a model through a series of states.
 
     Args:
         model: the model.

@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 
 _MUJOCO_ELEVATION, _ELEVATION = -45.0, -20.0
-"""Elevation of the free camera [degrees]: MuJoCo's default, which looks down on a robot, and the
-value that replaces it here.
+"""Elevation of the free camera [degrees]: MuJoCo's default, and the value that replaces it.
+
+The default looks too steeply down on a robot.
 """
 _GEOM = mujoco.mjtGeom
 _KIND_OF_GEOM = {

@@ -93,7 +93,7 @@ class Browser:
             time.sleep(max(0.0, _FRAME_TIME - (time.perf_counter() - now)))
 
     def run_pending(self) -> None:
-        """Execute the pending requests; of several for one field, only the last."""
+        """Execute the pending requests; of several requests for one field, only the last."""
         requests: dict[Any, Callable[[], None]] = {}
         while not self._pending.empty():
             key, action = self._pending.get()
@@ -261,16 +261,16 @@ class Browser:
         ) in session.config.actuators_by_name.items():
             suffix = f" {pattern}" if len(session.config.actuators_by_name) > 1 else ""
             family = actuator.family or type(actuator).__name__
-            change, fields_found = (
+            change, found_controls = (
                 functools.partial(session.set_actuator, pattern),
                 controls(actuator, _MAX_SUPPLY),
             )
             for part, fields in itertools.groupby(
-                fields_found,
+                found_controls,
                 lambda control: control.path[0] if len(control.path) > 1 else family,  # noqa: B023
             ):
                 self._add_settings(f"{part}{suffix}", fields, change)
-            if not fields_found:
+            if not found_controls:
                 gui.add_markdown(
                     f"{family}{suffix} has no settings: start the view with `--actuator`."
                 )
@@ -341,7 +341,7 @@ class Browser:
     def _add_settings(
         self, title: str, fields: Iterable[Control], change: Callable[[tuple[str, ...], Any], None]
     ) -> None:
-        """Add a folder with the sliders, and within it one with the numbers to type."""
+        """Add a folder with sliders and, inside it, a folder with the numbers that are typed."""
         gui, fields = self.server.gui, list(fields)
         with_slider = [
             control
@@ -421,7 +421,7 @@ def _triangles(shape: Shape, extent: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def limit_for_uplot(values: np.ndarray) -> np.ndarray:
-    """Return values that uPlot can draw: finite, and equal or apart by 1e-6 of the largest.
+    """Return values that uPlot can draw: finite, and equal or at least 1e-6 of the largest apart.
 
     If all values differ only by rounding errors, uPlot's search for ticks runs until the memory is
     exhausted.

@@ -1,6 +1,7 @@
 """Running simulation: steps, pushes, policies, and settings of actuators and disturbances.
 
-It contains no server. Its only window is MuJoCo's own viewer, on a machine with a display.
+The module contains no server; `run_native` shows a session in MuJoCo's own viewer, which needs a
+display.
 """
 
 import dataclasses
@@ -68,7 +69,7 @@ def controls(
     ends: Mapping[str, float] = MappingProxyType({}),
     path: tuple[str, ...] = (),
 ) -> list[Control]:
-    """Return the numbers, texts and flags in an actuator or disturbances, and in their parts.
+    """Return the controls for all numbers, texts and flags of an actuator or of disturbances.
 
     Args:
         settings: the dataclass.
@@ -131,8 +132,8 @@ def _slider_range(
 class Session:
     """An environment, the policy that acts in it, and its recent signals.
 
-    Invalid settings, unstable ones among them, are not simulated: `problem` has the reason, and
-    steps do nothing until the settings are changed. After a simulation has diverged, steps do
+    Invalid or unstable settings are not simulated: `problem` has the reason, and steps do nothing
+    until the settings are changed. After a simulation has diverged, steps do
     nothing until a reset.
     """
 
@@ -196,7 +197,7 @@ class Session:
 
     @property
     def is_stopped(self) -> bool:
-        """True if the simulation cannot continue at present."""
+        """True if the simulation cannot continue until a change or a reset."""
         return self.problem is not None
 
     # -- actions ----------------------------------------------------------------------------------
@@ -251,7 +252,7 @@ class Session:
         self._pushes[self.model.body(body).id] = (self.time + PUSH_DURATION, vector)
 
     def set_actuator(self, pattern: str, path: tuple[str, ...], value: Any) -> None:
-        """Set an actuator's field of a motor, or of the motors of a pattern.
+        """Set a field of the actuator of a motor, or of all motors that match a pattern.
 
         The motion continues, and the motor's state is reset.
         """
@@ -358,7 +359,7 @@ class Session:
             mujoco.mj_forward(self.model, self.data)
 
     def _update_poses(self) -> None:
-        """Update the poses: after a step they are those of its start."""
+        """Update the poses, which after a step are still those of its start."""
         physics = getattr(self.env.unwrapped, "physics", None)
         if physics is None:
             mujoco.mj_kinematics(self.model, self.data)
@@ -366,7 +367,7 @@ class Session:
             physics.show(physics.state)
 
     def _zero_action(self) -> Any:
-        """Return the action without force; None if there is none."""
+        """Return the action that causes no force; None if there is no such action."""
         space, setup = self.env.action_space, getattr(self.env.unwrapped, "setup", None)
         if isinstance(space, spaces.Box):
             return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)

@@ -69,7 +69,7 @@ def test_plots_show_the_filmed_episode(text):
     )
     steps = np.repeat(episode.signals["desired_force"], episode.inner_steps) * arm
     np.testing.assert_allclose(drawn["desired"][1][:-1], steps, rtol=1e-6)
-    error = curves(text, "Error: desired less actual")["desired less actual"][1][:-1]
+    error = curves(text, "Error: desired minus actual")["desired minus actual"][1][:-1]
     np.testing.assert_allclose(error, steps - episode.trace["actual_force"] * arm, atol=1e-6)
     reward = curves(text, "Reward of each step")["reward"]
     np.testing.assert_allclose(reward[1][:-1], episode.reward, rtol=1e-6)
@@ -151,7 +151,10 @@ def test_the_episode_is_the_median_one_or_has_its_rank(run):
     (episode,) = run_episodes(load_policy(run), load_config(run).evaluation_env.make, 1, 7)
     worse = sum(value < episode.total for value in (-900.0, -200.0, -1500.0, -300.0, -1000.0))
     assert "seed 7, return" in text
-    assert f"of 5 evaluated episodes {worse} returned less, the median -900 (seed 1000000)" in text
+    assert (
+        f"{worse} of 5 evaluated episodes had a lower return; the median is -900 (seed 1000000)"
+        in text
+    )
     write_evaluation(run, [])
     text = report_page(run).text
     assert "seed 0, return" in text
@@ -167,7 +170,7 @@ def test_the_best_policy_uses_the_median_of_its_own_evaluation(run, capsys):
     write_evaluation(run, [-7.0, -8.0, -9.0])
     for which, median in (("best", "-2 (seed 1000001)"), ("last", "-8 (seed 1000001)")):
         assert main(["replay", str(run), "--which", which, "--out", str(run / "r.html")]) == 0
-        assert f"returned less, the median {median}" in capsys.readouterr().out
+        assert f"had a lower return; the median is {median}" in capsys.readouterr().out
     assert main(["replay", str(run), "--actuator", "weaker", "--out", str(run / "r.html")]) == 0
     assert "evaluated" not in capsys.readouterr().out  # in another environment
 
@@ -195,7 +198,7 @@ def test_the_damage_of_a_run_is_named(run):
     parsed = report_page(run)
     assert "The run folder is damaged" in parsed.text
     assert "evaluation.json is not a policy evaluation: it is truncated" in parsed.text
-    assert "certificate.json is no certificate" in parsed.text
+    assert "certificate.json is not a certificate" in parsed.text
     assert "No episode of a<b> & run" in parsed.text
 
 
@@ -343,7 +346,7 @@ def test_a_third_party_robot_with_motors_is_filmed():
             [PENDULUM],
             "r.html",
             {"certificate": Path("certificate.json")},
-            "is no certificate: KeyError: 'checks'",
+            "is not a certificate: KeyError: 'checks'",
         ),
         ([Path("nowhere")], "r.html", {}, "no run at"),
     ],
