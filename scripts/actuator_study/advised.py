@@ -113,7 +113,7 @@ def left_out(evidence: Evidence) -> dict[str, float]:
                     errors.append(abs(loss.outcome.loss.mean - expected.outcome.loss.mean))
                     flips += loss.outcome.is_negligible != expected.outcome.is_negligible
     return {
-        "doses": len(errors),
+        "severities": len(errors),
         "mean_error": float(np.mean(errors or [0.0])),
         "off": int(np.sum(np.array(errors) > MARGIN)),
         "flips": flips,

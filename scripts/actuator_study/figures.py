@@ -77,7 +77,7 @@ def losses(path: Path, evidence: Evidence) -> bool:
     return drawn
 
 
-def insured(path: Path, evidence: Evidence) -> bool:
+def trainings(path: Path, evidence: Evidence) -> bool:
     """Draw policies' scores at the trained severities as dots, grouped by training arm.
 
     Returns:
@@ -88,8 +88,8 @@ def insured(path: Path, evidence: Evidence) -> bool:
     kinds = {
         "ideal": "ideal forces",
         "generic": "random actuators",
-        "drawn": "drawn doses",
-        "matched": "that dose",
+        "drawn": "drawn severities",
+        "matched": "the same severity",
     }
     figure = Figure(figsize=(10.0, 5.2), layout="constrained")
     panels: Any = figure.subplots(2, 1, sharey=True)
@@ -242,7 +242,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
             "time constant of the loop, a third of\nits settling time to 5 % [policy steps]"
         )
     for panel in panels[::3]:
-        panel.set_ylabel("voltage there is [needed voltage]")
+        panel.set_ylabel("available voltage [needed voltage]")
     shown = [region for number, region in enumerate(_REGIONS.items()) if number in shown_regions]
     handles = [Patch(facecolor=color, edgecolor="0.6", label=name) for name, color in shown]
     handles.append(
@@ -250,7 +250,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
             facecolor="white",
             edgecolor="0.4",
             hatch="//",
-            label="trained through whole motors at most",
+            label="trained at most through real motors",
         )
     )
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize="small")

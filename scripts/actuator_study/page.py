@@ -42,9 +42,9 @@ TRIALS, HYPOTHESES, ADVISED = "trials.csv", "hypotheses.csv", "advised.csv"
 """Tables with a row for every trial, for every question, and for every actuator of `advise`."""
 QUESTIONS: Mapping[str, str] = {
     "matters": "When does an actuator matter?",
-    "tune": "Tune or train?",
+    "tune": "Tune the loop, or train through it?",
     "wrong": "A wrong model",
-    "motors": "Motors that exist",
+    "motors": "Off-the-shelf motors",
     "command": "What should the policy command and see?",
 }
 """Titles of the sections of questions, by name."""
@@ -76,8 +76,8 @@ def write(collected: Collected, out: Path) -> list[Path]:
     parts = [
         "# What does an actuator cost?\n",
         read_conclusions(out / PAGE),
-        _borne(evidence, drawn),
-        _insured(drawn),
+        _tolerated(evidence, drawn),
+        _compare_trainings(drawn),
         _motors(evidence, drawn),
         _advised(evidence, advice_rows, drawn),
         _verdicts(primary_verdicts, secondary_verdicts),
@@ -113,7 +113,8 @@ def write_tables(
 
 def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:
     """Draw the figures; return their paths by name, without those that have no data."""
-    drawers = {"losses": figures.losses, "insured": figures.insured, "chart": figures.chart}
+    # Names of files are published and stay.
+    drawers = {"losses": figures.losses, "insured": figures.trainings, "chart": figures.chart}
     paths = {
         name: path
         for name, draw in drawers.items()
@@ -147,7 +148,7 @@ def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:
                 else []
             ),
         ]
-    figures.bars(paths["motors"], scores, motors, "Motors of the catalogue")
+    figures.bars(paths["motors"], scores, motors, "Motors of the catalog")
     return paths
 
 
@@ -155,7 +156,7 @@ def _figure(drawn: Mapping[str, Path], name: str, caption: str) -> str:
     return f"![{caption}]({FOLDER}/{drawn[name].name})\n" if name in drawn else ""
 
 
-def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
+def _tolerated(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
     """Return the section on tolerated severities, in a task's units, with the map of all losses."""
     rows = []
     for task in SECONDS:
@@ -185,22 +186,24 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
                 text += f" {unit_text}"
             rows[-1].append(text if known else "–")
     margin = FAILURE_MARGIN
-    return f"""## What policies bear
+    return f"""## What policies tolerate
 
-Up to the first number it is harmless: ideal-trained policies lose at most {MARGIN:g} of the score on the mean, surely
-at most {margin:g}, and a tenth of their success. From the second on it hurts: they surely lose more than {margin:g},
-or a tenth of their success. In brackets: how many of 20 fail there, by losing more than {margin:g}. Between the two,
-measure.
+Severities up to the first number are harmless: ideal-trained policies lose at most {MARGIN:g} of the score on average,
+the confidence interval ends at or below {margin:g}, at most a tenth of the policies fail, and at most a tenth of the success is
+lost. Severities from the second number on hurt: the whole interval of the loss is above {margin:g}, or that of the lost
+success is above a tenth. The number in brackets says how many of 20 policies fail there, because they lose more than
+{margin:g}. Between the two numbers, measure.
 
-*Lag* is a time constant: a loop of bandwidth f has 1/(2 π f). *Missing force* is the share that a gear loses,
-*friction* what brakes at any command. *Missing voltage* is a share of [what the task needs](plan.md#doses), all the
-time, under a loop with anti-windup: without it 35 % ruins four of 20 policies on Furuta. Each was tested alone.
+*Lag* is a time constant: a loop of bandwidth f has 1/(2 π f). *Missing force* is the share that a gear loses. *Friction*
+brakes at any command. *Missing voltage* is a share of [the voltage that the task needs](plan.md#severities). It is
+missing all the time, under a loop with anti-windup. Without anti-windup 35 % ruins four of 20 policies on Furuta. Each
+effect was tested separately.
 
 {markdown_table(["task: policy step, largest force", *THINGS.values()], rows)}
-{_figure(drawn, "losses", "What ideal-trained policies lose, by task and dose")}"""
+{_figure(drawn, "losses", "Losses of ideal-trained policies, by task and severity")}"""
 
 
-def _insured(drawn: Mapping[str, Path]) -> str:
+def _compare_trainings(drawn: Mapping[str, Path]) -> str:
     if "insured" not in drawn:
         return ""
     rows = [
@@ -213,16 +216,16 @@ def _insured(drawn: Mapping[str, Path]) -> str:
         ]
         for task in arms.TRAINED
     ]
-    return f"""## Train through it, or randomise?
+    return f"""## Train through it, or randomize?
 
-Twenty policies a column, tested at one dose of each thing, which was chosen to hurt. Nothing is known of larger ones:
-measure.
+Every column has twenty policies. They are tested at a single severity of each effect, which was chosen to hurt. Larger
+severities were not tested: measure.
 
 {markdown_table(["trained and tested at", *THINGS.values()], rows)}
-*Random actuators* draws strength, lag, delay and pushes, which three of the six things are of. It reaches the lag that
-is tested on Pendulum, and 0.8 of its two steps of delay; on Furuta four times the lag and 1.6 times the delay.
+*Random actuators* draw strength, lag, delay and pushes. These cover three of the six effects. On Pendulum they reach the
+tested lag, and 0.8 of the tested two steps of delay. On Furuta they reach four times the lag and 1.6 times the delay.
 
-{_figure(drawn, "insured", "Scores by what policies were trained on")}"""
+{_figure(drawn, "insured", "Scores by kind of training")}"""
 
 
 def _motors(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
@@ -240,12 +243,12 @@ def _motors(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
     header = ["task", "motor, gear", "", "trained on ideal forces", "trained through it"]
     return f"""## Off-the-shelf motors
 
-What policies lose, how many of 20 fail, and how much of their success goes. *Good* is the smallest motor that
-`codrl-mj motor choose` found sufficient, *marginal* one that it called `try it`. On the cars the good one rubs away an
-eighth of the largest force; since then `motor choose` allows a twentieth.
+A cell has the lost score with its interval, the number of 20 policies that fail, and the lost success. *Good* is the smallest motor that
+`codrl-mj motor choose` found sufficient, and *marginal* is one for which it answered `try it`. On the cars, friction of
+the good motor takes an eighth of the largest force. `motor choose` now allows only a twentieth.
 
 {markdown_table(header, rows)}
-{_figure(drawn, "motors", "Scores on motors of the catalogue")}"""
+{_figure(drawn, "motors", "Scores on motors of the catalog")}"""
 
 
 def _lost(outcome: Outcome | None) -> str:
@@ -294,23 +297,22 @@ def _advised(
     ]
     left = advised.left_out(evidence)
     header = ["task", "actuator", "predicted", "measured", "advise says", "measurement says"]
-    text = f"""Of {len(judgments)} actuators that none of the doses was taken from, `codrl-mj advise`
-([how](../advise.md)) was right about {judgments.count("right")}
+    text = f"""We asked `codrl-mj advise` ([how](../advise.md)) about {len(judgments)} actuators from which no severity
+was taken, without the measurements on the actuator itself. It was right about {judgments.count("right")}
 ({", ".join(f"{count} times *{verdict}*" for verdict, count in right.most_common())}) and wrong about
-{judgments.count("wrong")}, without what was measured on the one it is asked about. For
-{judgments.count("says nothing")} it says to measure, and for
-{judgments.count("not tested")} what was not tested. It never said
-{", ".join(never)}: these are untested. All that are not right:"""
-    return f"""## What `advise` says, and how right it is
+{judgments.count("wrong")}. For {judgments.count("says nothing")} it recommends a measurement, and for
+{judgments.count("not tested")} a remedy that was not tested. It never answered {", ".join(never)}, so these answers are
+untested. The table has all actuators for which it was not right:"""
+    return f"""## The accuracy of `advise`
 
 {textwrap.fill(" ".join(text.split()), 120, break_long_words=False)}
 
 {markdown_table(header, rows)}
-The predicted loss is {np.mean(errors):.2f} off on the mean, and {np.mean(large):.2f} where more than {MARGIN:g} is
-lost. Of {left["doses"]} doses, each predicted from its neighbours, {left["off"]} are off by more than {MARGIN:g} (mean
-{left["mean_error"]:.3f}), and {left["flips"]} change sides between harmless and not.
+The mean error of the predicted loss is {np.mean(errors):.2f}, and {np.mean(large):.2f} where policies lose more than
+{MARGIN:g}. We also predicted {left["severities"]} severities from their neighbors: {left["off"]} errors exceed {MARGIN:g}
+(mean {left["mean_error"]:.3f}), and {left["flips"]} severities change between harmless and not harmless.
 
-{_figure(drawn, "chart", "What to do about an actuator that is late or short of voltage")}"""
+{_figure(drawn, "chart", "Recommended option for an actuator with a lag or with too little voltage")}"""
 
 
 def _verdicts(verdicts: Sequence[Verdict], others: Sequence[Verdict]) -> str:
@@ -322,7 +324,7 @@ def _verdicts(verdicts: Sequence[Verdict], others: Sequence[Verdict]) -> str:
             verdict.outcome == "open"
             and (seeds := verdict.seeds_to_close(len(verdicts))) is not None
         ):
-            statement += f" (about {seeds} seeds would tell)"
+            statement += f" (about {seeds} seeds would decide it)"
         tested, planned = verdict.strata
         if tested < planned:
             statement += f" ({tested} of {planned} comparisons have runs)"
@@ -335,7 +337,7 @@ def _verdicts(verdicts: Sequence[Verdict], others: Sequence[Verdict]) -> str:
                 statement,
             ]
         )
-    header = ["", "holds", "effect [95 %]", "corrected p", "says"]
+    header = ["", "holds", "effect [95 %]", "corrected p", "hypothesis"]
     wrong = [
         verdict
         for verdict in others
@@ -349,9 +351,10 @@ def _verdicts(verdicts: Sequence[Verdict], others: Sequence[Verdict]) -> str:
 {markdown_table(header, rows)}
 \\* P{_EACH[3:]}.
 
-Seven of those that hold could hardly fail. P1 to P5: doses were chosen in a pilot so that ideal-trained policies lose.
-P9: the loop was badly detuned. P10: errors of both signs cancel in its mean; their mean *size* is {np.mean(sizes):.3f}
-over {len(wrong)} cases, the largest {np.max(sizes):.3f}. P6, P7, P8, P11 and P12 could have gone either way.
+Seven of the confirmed hypotheses could hardly fail. P1 to P5: the severities were chosen in a pilot so that
+ideal-trained policies lose. P9: the loop was badly detuned. P10: errors of both signs cancel in the mean; their mean
+*size* is {np.mean(sizes):.3f} over {len(wrong)} cases, and the largest is {np.max(sizes):.3f}. P6, P7, P8, P11 and P12
+could have gone either way.
 """
 
 
@@ -397,11 +400,12 @@ def _secondary(verdicts: Sequence[Verdict], drawn: Mapping[str, Path]) -> str:
     """Return the section on secondary comparisons, with the figure of current loops."""
     return f"""## The other comparisons
 
-With a false discovery rate of 5 %, and by how much by the 95 % interval:
+All secondary comparisons have a false discovery rate of 5 %. The last column counts those whose 95 % interval is beyond
+the margin:
 
 {decided_table(verdicts, QUESTIONS)}
-What was explored beyond the plan, without p, stands in [trials]({FOLDER}/{TRIALS}): loops without anti-windup, and the
-paper's loop otherwise.
+The table of [trials]({FOLDER}/{TRIALS}) also has tests beyond the plan, without p-values: loops without anti-windup, and
+variants of the paper's loop.
 
 {_figure(drawn, "tune", QUESTIONS["tune"])}"""
 
@@ -413,11 +417,11 @@ def _missing(collected: Collected) -> str:
     return (
         "\n".join(
             [
-                "## What is missing",
+                "## Missing results",
                 "",
                 (
-                    f"{collected.totals.missing} trainings and tests, of which"
-                    f" {len(collected.failures)} failed. `python scripts/study_actuators.py"
+                    f"{collected.totals.missing} trainings and tests are missing;"
+                    f" {len(collected.failures)} of them failed. `python scripts/study_actuators.py"
                     " --dry-run` lists them."
                 ),
                 *shown,
@@ -438,19 +442,20 @@ def _method(collected: Collected, scores: Scores) -> str:
         f"{task} {FLOORS[task]:g} to {ceiling:.1f}" for task, ceiling in scores.ceilings.items()
     ]
     runs = max(len(grid.seeds_of(grid.arms[0])), 2)
-    about = f"""By [the plan](plan.md): {num_trained} of {num_planned} trainings
-({totals.seconds / 3600:.1f} hours of one core) and {tested} of {tests} tests; code with its runs: {codes}.
-`scripts/study_actuators.py` ([how](../studies.md)) writes this page,
+    about = f"""The study follows [its plan](plan.md). It has {num_trained} of {num_planned} trainings
+({totals.seconds / 3600:.1f} hours of one core) and {tested} of {tests} tests. Versions of the code, with the number of
+their runs: {codes}. `scripts/study_actuators.py` ([how](../studies.md)) writes this page and four tables:
 [hypotheses]({FOLDER}/{HYPOTHESES}), [trials]({FOLDER}/{TRIALS}), [runs]({FOLDER}/{RUNS}) and
-[advised]({FOLDER}/{ADVISED}). `examples/recompute.py` recomputes the conclusions without this package."""
-    text = f"""A score is the mean return over {grid.episodes} test episodes in shares of the span: 0 is what random
-actions get on ideal forces, 1 what ideal-trained policies get there on the mean ({"; ".join(known) or "none yet"}).
-CartPole's return is the paper's: steps within 0.1 m of the centre. In {TRIALS} *failed* is the share of policies that
-score below {1 - FAILURE_MARGIN:g}. Effects are differences of mean scores; policies
-count once on every task. Intervals are by Student's t, p of permutation tests, of equivalence by two one-sided ones
-with a margin of {MARGIN:g}; primary ones are corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds
-a difference of {detectable_difference(runs, LEVEL / 12):.2f} standard deviations is found with a
-chance of 80 % at the strictest level."""
+[answers of `advise`]({FOLDER}/{ADVISED}). `examples/recompute.py` recomputes the conclusions without this package."""
+    text = f"""A score is the mean return over {grid.episodes} test episodes as a share of the span: 0 is the return of
+random actions on ideal forces, and 1 is the mean return of ideal-trained policies there
+({"; ".join(known) or "none yet"}). On CartPole the return counts the steps within 0.1 m of the center, as in the paper.
+In {TRIALS} *failed* is the share of policies that score below {1 - FAILURE_MARGIN:g}. Effects are differences of mean
+scores, and a policy counts once on every task. Intervals are Student's t intervals. The p-values come from permutation
+tests; equivalence takes two one-sided tests with a margin of {MARGIN:g}. Primary p-values are corrected by Holm's method,
+the others by that of Benjamini and Hochberg. With {runs} seeds, a difference of
+{detectable_difference(runs, LEVEL / 12):.2f} standard deviations is found with a probability of 80 % at the strictest
+level."""
     # Links may be longer than a line and must not be broken.
     wrapped = (
         textwrap.fill(" ".join(paragraph.split()), 120, break_long_words=False)

@@ -151,8 +151,8 @@ def primary() -> list[Question]:
         Question(
             "P7",
             "matters",
-            "Over all six: training through the same actuator scores higher than generic"
-            " robustification as the plan has it",
+            "Over all six effects: training through the same actuator scores higher than training"
+            " on random actuators as defined in the plan",
             tuple(
                 pair
                 for axis in AXES
@@ -162,8 +162,8 @@ def primary() -> list[Question]:
         Question(
             "P8",
             "matters",
-            "Over four: policies trained on drawn doses score as high as those trained on the same"
-            " dose",
+            "Over four effects: policies trained on drawn severities score as high as those trained"
+            " at the same severity",
             tuple(
                 pair
                 for axis in DRAWN
@@ -199,7 +199,7 @@ def primary() -> list[Question]:
         Question(
             "P11",
             "motors",
-            "On a good motor that exists, ideal-trained policies score as high as on ideal forces",
+            "On a good off-the-shelf motor, ideal-trained policies score as high as on ideal forces",
             tuple(
                 Contrast(on_motor(ideal(task), "good"), ideal_trial(ideal(task)))
                 for task in SECONDS
@@ -209,7 +209,7 @@ def primary() -> list[Question]:
         Question(
             "P12",
             "motors",
-            "On a marginal motor that exists, policies trained through it score higher than"
+            "On a marginal off-the-shelf motor, policies trained through it score higher than"
             " ideal-trained ones",
             tuple(
                 Contrast(

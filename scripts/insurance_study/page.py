@@ -49,16 +49,22 @@ PAGE, FOLDER, FIGURE = "insurance.md", "insurance", "insured.svg"
 """The page, the folder beside it with its figure and tables, and the figure."""
 KIND_NAMES: Mapping[str, str] = {
     "ideal": "ideal forces",
-    "matched": "the same dose",
-    "drawn": "the same thing, drawn (without delay, friction)",
-    "remembering": "the same dose, seeing its last commands (lag, delay alone)",
+    "matched": "the same severity",
+    "drawn": "the same effect, severity drawn (without delay, friction)",
+    "remembering": "the same severity, observing the last commands (only lag, delay)",
     "random": "random actuators",
     "half": "random actuators, half the reach",
     "double": "random actuators, twice the reach",
-    "pushes": "random pushes alone",
-    "strength": "random strength alone",
+    "pushes": "random pushes only",
+    "strength": "random strength only",
 }
 """Kind of training -> name on the page."""
+SECTION_TITLES: Mapping[str, str] = {
+    "insured": "at the trained severities",
+    "home": "on ideal forces",
+    "other doses": "at other severities",
+}
+"""Section of secondary questions, as in the published rows -> title on the page."""
 PLANNED = 20
 """Number of policies of every kind that a verdict needs."""
 _AXES: Mapping[str, Sequence[str]] = {"drawn": DRAWN, "remembering": REMEMBERED}
@@ -66,7 +72,7 @@ _AXES: Mapping[str, Sequence[str]] = {"drawn": DRAWN, "remembering": REMEMBERED}
 
 _SHOWN: Mapping[str, str] = {
     "ideal": "ideal forces",
-    "matched": "the same dose",
+    "matched": "the same severity",
     "drawn": "drawn",
     "random": "random",
     "double": "random, twice",
@@ -129,11 +135,11 @@ def write(collected: Collected, out: Path) -> list[Path]:
     write_csv(folder / LEARNING, learned)
     draw(folder / FIGURE, scores)
     parts = [
-        "# What insures a policy?\n",
+        "# What makes a policy robust to its motor?\n",
         read_conclusions(out / PAGE),
         _things(collected, scores),
         _kinds(collected, scores),
-        f"![Scores by what policies were trained on]({FOLDER}/{FIGURE})\n",
+        f"![Scores by kind of training]({FOLDER}/{FIGURE})\n",
         _verdicts(primary_verdicts, scores),
         _secondary(secondary_verdicts),
         _method(collected, *still_rising(learned, spans, MARGIN)),
@@ -177,13 +183,14 @@ def _things(collected: Collected, scores: Scores) -> str:
         title = f"{TITLES[task]}, a step of {1000 * find_task(task).step_duration:g} ms"
         tables.append(markdown_table([title, *_SHOWN.values()], rows))
     margin = FAILURE_MARGIN
-    text = f"""Look for what is most like yours. Mean score, 1 being ideal-trained policies on ideal forces and 0 random
-actions; how many of {PLANNED} policies fail, by losing more than {margin:g}; how often episodes succeed. The highest
-mean is bold. *Random* actuators draw strength, lag and delay for every episode, and push; they reach as far as is said
-in brackets, or twice as far. *The same dose* is what it is tested on; *drawn* is that one thing alone, from none
-to twice as much, of forces and voltages at most 70 %. Forces are shares of the largest one, or N·m; voltages are shares
-of [what the task needs](plan.md#doses)."""
-    return f"""## What each kind of training comes to
+    text = f"""Look for the row that is closest to your case. A cell has the mean score, where 1 is the mean of
+ideal-trained policies on ideal forces and 0 that of random actions; the number of {PLANNED} policies that fail, because
+they lose more than {margin:g}; and the share of successful episodes. The highest mean is bold. *Random* actuators draw
+strength, lag and delay for every episode, and push. Their reach is given in brackets; *random, twice* reaches twice as
+far. *The same severity* trains on the tested severity. *Drawn* draws the severity of this one effect from zero to twice
+the tested one, at most 70 % for forces and voltages. A force is a share of the largest one, or in N·m. A voltage is a
+share of [the voltage that the task needs](plan.md#severities)."""
+    return f"""## Results by kind of training
 
 {textwrap.fill(" ".join(text.split()), 120, break_long_words=False)}
 
@@ -206,12 +213,13 @@ def _kinds(collected: Collected, scores: Scores) -> str:
         rows.append(cells)
     header = [
         "trained on",
-        *(text for task in TASKS for text in (f"{TITLES[task]}: ideal", "six doses")),
+        *(text for task in TASKS for text in (f"{TITLES[task]}: ideal", "six severities")),
     ]
-    return f"""## Every kind of training, on the mean
+    return f"""## Means over all effects
 
-Mean score on ideal forces. Then on the six doses above, or those of them that are named: mean, median; how many tests
-failed, a policy's on a dose each; success. The six hide much: compare rows above first.
+The columns *ideal* have the mean score on ideal forces. The columns *six severities* pool the severities of the tables
+above, or those of the named effects. They have the mean and the median score, the number of failed tests, and the
+success. One test is one policy at one severity. These means hide large differences: compare the rows above first.
 
 {markdown_table(header, rows)}"""
 
@@ -270,10 +278,10 @@ def _verdicts(verdicts: Sequence[Verdict], scores: Scores) -> str:
             p_text(verdict.corrected_p),
         ]
         rows.append([verdict.question.name, *judged, str(min(verdict.runs)), statement])
-    header = ["", "holds", "effect [95 %]", "by task", "corrected p", "policies", "says"]
+    header = ["", "holds", "effect [95 %]", "by task", "corrected p", "policies", "hypothesis"]
     return f"""## The ten hypotheses
 
-Nothing is judged before there are {PLANNED} policies of every kind. Tasks: {_TASKS}.
+A hypothesis is judged only with {PLANNED} policies of every kind. The column *by task* has the effects on {_TASKS}.
 
 {markdown_table(header, rows)}"""
 
@@ -300,12 +308,11 @@ def _by_task(verdict: Verdict, scores: Scores) -> str:
 
 
 def _secondary(verdicts: Sequence[Verdict]) -> str:
-    titles = {verdict.question.section: verdict.question.section for verdict in verdicts}
     if all(np.isnan(verdict.p) for verdict in verdicts):
-        return f"The {len(verdicts)} others, each of one task, are not judged yet either.\n"
-    return f"""Others, each of one task, with a false discovery rate of 5 %:
+        return f"The {len(verdicts)} secondary comparisons, each of one task, are not judged yet.\n"
+    return f"""All secondary comparisons are of one task each. Their false discovery rate is 5 %:
 
-{decided_table(verdicts, titles)}"""
+{decided_table(verdicts, SECTION_TITLES)}"""
 
 
 def _method(collected: Collected, rising: Sequence[str], count: int) -> str:
@@ -314,15 +321,14 @@ def _method(collected: Collected, rising: Sequence[str], count: int) -> str:
         sum(map(len, collected.evaluations.values())),
         len(collected.grid.deployments),
     )
-    text = f"""By [the plan](insurance_plan.md), scores and tests as in [what an actuator costs](actuators.md).
-{num_tested} of {num_tests} tests of {num_planned} policies are there
-({totals.seconds / 3600:.1f} hours of one core at hand).
-`scripts/study_insurance.py` ([how](../studies.md)) writes this page, [every
-policy]({FOLDER}/{RUNS}), [trials]({FOLDER}/{TRIALS}) with medians and
-failures, [every comparison]({FOLDER}/{HYPOTHESES}), and [what was returned in tenths of the
-training]({FOLDER}/{LEARNING}). Of {count} kinds of training {len(rising)} had not levelled off
-({"; ".join(rising) or "none"}): in their last tenth they return more than in the eighth, on the mean by more than
-{MARGIN:g} of the span."""
+    text = f"""The study follows [its plan](insurance_plan.md), with the scores and tests of [the first
+study](actuators.md). It has {num_tested} of {num_tests} tests of {num_planned} policies
+({totals.seconds / 3600:.1f} hours of one core in the available runs).
+`scripts/study_insurance.py` ([how](../studies.md)) writes this page and four tables: [policies]({FOLDER}/{RUNS}),
+[trials]({FOLDER}/{TRIALS}) with medians and failures, [comparisons]({FOLDER}/{HYPOTHESES}), and [mean returns in each
+tenth of a training]({FOLDER}/{LEARNING}). Of {count} kinds of training {len(rising)} had not leveled off
+({"; ".join(rising) or "none"}). Their mean return in the last tenth is more than {MARGIN:g} of the span above that in
+the eighth."""
     return (
         "## How it was measured\n\n"
         + textwrap.fill(" ".join(text.split()), 120, break_long_words=False)

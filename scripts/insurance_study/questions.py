@@ -195,45 +195,54 @@ COMPARED: Mapping[str, tuple[str, str, tuple[str, ...], str]] = {
         "matched",
         "random",
         tuple(AXES),
-        "training through the same dose scores higher than random actuators",
+        "training at the same severity scores higher than random actuators",
     ),
-    "I2": ("random", "ideal", tuple(AXES), "random actuators score higher than ideal forces"),
+    "I2": (
+        "random",
+        "ideal",
+        tuple(AXES),
+        "training on random actuators scores higher than on ideal forces",
+    ),
     "I5": (
         "drawn",
         "random",
         DRAWN,
-        "doses of the same thing, drawn, score higher than random actuators",
+        "training on drawn severities of the same effect scores higher than random actuators",
     ),
     "I6": (
         "random",
         "pushes",
         tuple(AXES),
-        "random actuators score higher than random pushes alone",
+        "random actuators score higher than random pushes only",
     ),
     "I7": (
         "random",
         "strength",
         tuple(AXES),
-        "random actuators score higher than random strength alone",
+        "random actuators score higher than random strength only",
     ),
     "I8": (
         "remembering",
         "matched",
         REMEMBERED,
-        "seeing its last commands lets a policy score higher",
+        "observing the last commands lets a policy score higher",
     ),
     "I9": (
         "random",
         "half",
         tuple(AXES),
-        "random actuators score higher than those of half the reach",
+        "random actuators score higher than those with half the reach",
     ),
-    "I10": ("double", "random", tuple(AXES), "random actuators of twice the reach score higher"),
+    "I10": ("double", "random", tuple(AXES), "random actuators with twice the reach score higher"),
 }
 """Hypothesis -> kind, reference kind, axes, statement: at the trained severities, pooled."""
 AT_HOME: Mapping[str, tuple[str, tuple[str, ...], str]] = {
-    "I3": ("random", ("lag",), "on ideal forces random actuators cost nothing"),
-    "I4": ("matched", tuple(AXES), "on ideal forces training through one thing costs nothing"),
+    "I3": ("random", ("lag",), "on ideal forces, random actuators cost nothing"),
+    "I4": (
+        "matched",
+        tuple(AXES),
+        "on ideal forces, training through a single effect costs nothing",
+    ),
 }
 """Hypothesis -> kind, axes, statement: equivalence."""
 
@@ -255,6 +264,7 @@ def primary() -> list[Question]:
 @functools.cache
 def secondary() -> list[Question]:
     """Return all secondary questions, each on a single task, in sections."""
+    # Names of sections are values of published rows; the page shows other titles.
     parts: list[tuple[str, str, tuple[Contrast, ...]]] = []
     every, at_home_too = (
         tuple(AXES),

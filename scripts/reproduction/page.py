@@ -52,10 +52,10 @@ def _head(findings: Findings) -> str:
             f"\n**A trial: every training was cut off after {findings.plan['episodes']} episodes. "
             "Its verdicts say nothing about the paper.**\n"
         )
-    return f"""# The paper's experiments, done again
+    return f"""# Reproduction of the paper's experiments
 {trial}
-*Control-Optimized Deep Reinforcement Learning* (arXiv 2507.00268) reports one run of each experiment. Here each is
-trained over seeds, and every statement judged [by a rule](../reproduction.md#how-it-is-judged).
+*Control-Optimized Deep Reinforcement Learning* (arXiv 2507.00268) reports one run of each experiment. We train
+each experiment with several seeds, and judge every statement [by a rule](../reproduction.md#how-it-is-judged).
 """
 
 
@@ -135,9 +135,9 @@ def verdicts_line(verdicts: Judged) -> str:
     counts = collections.Counter(verdict.outcome for claim, verdict in paper if claim.counted)
     outcomes = ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOMES if counts[outcome])
     return f"""\
-**Of {counts.total()} statements: {outcomes}.** *Confirmed*, *not confirmed*, *open*: the 95 % interval [in brackets] is
-inside, outside, across what is said. *Compatible*: what one run or episode showed could be one of ours; the more these
-scatter, the easier.
+**Of {counts.total()} statements: {outcomes}.** The 95 % interval [in brackets] is inside the stated
+range (*confirmed*), outside (*not confirmed*), or across its edge (*open*). *Compatible* means that the paper's single
+run or episode could be one of ours. This is easier to reach if ours scatter more.
 """
 
 
@@ -178,7 +178,7 @@ def _method(findings: Findings) -> str:
         (CLAIM_ROWS, "verdicts"),
         (RUNS, "trainings"),
         (CURVES, "curves"),
-        (EVERYTHING, "the rest"),
+        (EVERYTHING, "everything else"),
     )
     links, episodes = (
         ", ".join(f"[{name}]({FOLDER}/{file})" for file, name in files),
@@ -186,9 +186,9 @@ def _method(findings: Findings) -> str:
     )
     return f"""## How it was measured
 
-{len(rows)} trainings, {hours:.1f} hours of one core; every policy tested greedily in {episodes} episodes on the
-actuator of its training. `scripts/reproduce.py` ([how](../reproduction.md)) writes this page: {links}.
-`examples/recompute_reproduction.py` finds every verdict again from the first two, without the package.
+The {len(rows)} trainings took {hours:.1f} hours on one core. Every policy was tested with greedy actions in {episodes} episodes
+on the actuator of its training. `scripts/reproduce.py` ([how](../reproduction.md)) writes this page and its data:
+{links}. `examples/recompute_reproduction.py` recomputes every verdict from the first two, without the package.
 """
 
 
@@ -200,10 +200,10 @@ def _missing(findings: Findings) -> str:
     lines = [*lines, *(f"- {name} failed: {error}" for name, error in findings.failures.items())]
     if not lines:
         return ""
-    return "\n".join(["## What is missing\n", _MISSING, *lines, ""])
+    return "\n".join(["## Missing results\n", _MISSING, *lines, ""])
 
 
 _MISSING = (
-    "Planned, and either not trained or without what is published now; verdicts are of the"
-    " others.\n"
+    "These trainings are planned, but either not finished or without all of today's columns. The"
+    " verdicts use the others.\n"
 )

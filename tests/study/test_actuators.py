@@ -293,7 +293,7 @@ def test_without_results_no_question_is_judged(tmp_path):
     files = write(grid.collect(), tmp_path / "out")
     text = files[0].read_text()
     assert f"0 of {len(grid.cells)} trainings" in text
-    assert "What is missing" in text
+    assert "Missing results" in text
 
 
 @pytest.mark.matrix

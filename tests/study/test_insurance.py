@@ -119,7 +119,7 @@ def test_the_study_computes_what_the_plan_states():
     plan = (RESULTS / "insurance_plan.md").read_text()
     arms = {trial.arm.name for trial in trials() if needs_new_policies(trial)}
     assert f"{len(arms)} new arms" in plan
-    assert f"p before {PLANNED} policies of every kind" in plan
+    assert f"no p before {PLANNED} policies of every kind" in plan
     assert f"All others ({len(secondary())}, each of one task)" in " ".join(plan.split())
     for number, question in enumerate(primary(), start=1):
         line = next(line for line in plan.splitlines() if line.startswith(f"| I{number} |"))
@@ -207,7 +207,7 @@ def test_the_page_states_the_true_results(written):
     assert (
         "| random actuators | 1.00 | 0.70, 0.70; 24 of 24;" in page
     )  # Four policies on six severities.
-    assert "| the same dose | 1.00 | 0.90, 0.90;" in page
+    assert "| the same severity | 1.00 | 0.90, 0.90;" in page
     assert "| Acrobot, a step of 200 ms | ideal forces |" in page
     assert "| delay 600 ms (400 ms) | 0.50; 4; " in page.replace("\u00a0", " ")
     (row,) = (line for line in page.splitlines() if line.startswith("| friction 0.2 N·m | "))
@@ -225,7 +225,7 @@ def test_questions_with_fewer_policies_than_planned_are_not_judged(written, tmp_
     InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=4).write()
     page = (tmp_path / "insurance.md").read_text()
     assert page.count("| not judged |") == 10
-    assert "The 266 others, each of one task, are not judged yet either." in page
+    assert "The 266 secondary comparisons, each of one task, are not judged yet." in page
     judged = read_csv(tmp_path / "insurance" / "hypotheses.csv")
     assert {(row["outcome"], row["p"], row["corrected_p"]) for row in judged} == {
         ("not judged", "", "")

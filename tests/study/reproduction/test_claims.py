@@ -148,15 +148,15 @@ def test_true_claims_are_confirmed_or_for_single_runs_compatible():
     statements = outcomes(world(PAPERS), PAPER_SAYS)
     assert statements[NOT_CONFIRMED] == statements[NOT_TESTABLE] == statements[OPEN] == set()
     assert statements[COMPATIBLE] == {
-        ("mountain_car", "return, last 50"),
-        ("mountain_car", "goal"),
-        ("mountain_car", "goal, gains 2, 10, 1e-6"),
-        ("mountain_car", "goal, no motor"),
-        ("mountain_car_continuous", "goal"),
-        ("acrobot", "return, last 50"),
-        ("acrobot", "goal"),
-        ("cartpole", "whole epochs from"),
-        ("cartpole", "return near 4000 from"),
+        ("mountain_car", "return of the last 50 episodes"),
+        ("mountain_car", "time to the goal"),
+        ("mountain_car", "time to the goal, gains 2, 10, 1e-6"),
+        ("mountain_car", "time to the goal, no motor"),
+        ("mountain_car_continuous", "time to the goal"),
+        ("acrobot", "return of the last 50 episodes"),
+        ("acrobot", "time to the goal"),
+        ("cartpole", "first whole epoch"),
+        ("cartpole", "first epoch with a return near 4000"),
     }
     assert outcomes(world(PAPERS), PORT)[CONFIRMED]
 
@@ -164,18 +164,18 @@ def test_true_claims_are_confirmed_or_for_single_runs_compatible():
 def test_false_claims_are_not_confirmed():
     refuted = outcomes(world(OTHERS), PAPER_SAYS)[NOT_CONFIRMED]
     assert refuted == {
-        ("mountain_car", "return, last 50"),
+        ("mountain_car", "return of the last 50 episodes"),
         ("mountain_car", "torque error, gains 2, 10, 1e-6"),
-        ("mountain_car", "goal"),
-        ("mountain_car", "goal, no motor"),
+        ("mountain_car", "time to the goal"),
+        ("mountain_car", "time to the goal, no motor"),
         ("mountain_car", "beats no motor"),
         ("mountain_car", "beats gains 2, 10, 1e-6"),
         ("acrobot", "torque error"),
-        ("acrobot", "return, last 50"),
-        ("acrobot", "goal"),
+        ("acrobot", "return of the last 50 episodes"),
+        ("acrobot", "time to the goal"),
         ("cartpole", "largest torque error"),
-        ("cartpole", "whole epochs from"),
-        ("cartpole", "return near 4000 from"),
+        ("cartpole", "first whole epoch"),
+        ("cartpole", "first epoch with a return near 4000"),
     }
 
 
