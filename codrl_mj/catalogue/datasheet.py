@@ -39,7 +39,8 @@ class Datasheet:
     """
 
     shaft: str | None = None
-    """Shaft of the mechanical values: `motor`, or `output`, behind the gear; required with a gear.
+    """Shaft at which torques, speeds, inertias and friction are stated: `motor`, or `output` behind
+    the gear; required with a gear.
     """
     nominal_voltage: str | None = _printed("V", "12 V", also="voltage rated_voltage")
     """Voltage at which the values below are stated."""

@@ -269,7 +269,7 @@ def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> En
     )
     config = EnvConfig(task, actuators, options=options)
     if patterns:
-        config = EnvConfig(task, source.overlaid(config, patterns), options=options)
+        config = EnvConfig(task, source.override_actuators(config, patterns), options=options)
     actuator_fields = _set_fields(verb.actuator_fields)
     overridden = {
         pattern: override_actuator(actuator, actuator_fields)

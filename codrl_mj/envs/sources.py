@@ -188,8 +188,8 @@ class EnvSource(abc.ABC):
         """Return pattern -> actuator from the result of `actuators`."""
         return dict(actuators)
 
-    def overlaid(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
-        """Return pattern -> actuator: `patterns`, and the configuration's for all other motors."""
+    def override_actuators(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
+        """Return pattern -> actuator: those in `patterns`, else the configured ones."""
         from codrl_mj.engine.reading import actuators_sharing_motor
         from codrl_mj.engine.specs import match_pattern, matchable_names
 

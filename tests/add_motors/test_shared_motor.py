@@ -234,7 +234,7 @@ def test_evaluation_variants_keep_a_shared_motor(monkeypatch):
     )
     config = codrl_mj.EnvConfig("Leg-v0", ACTUATORS, max_episode_steps=10)
     lag = Lag(time_constant=0.01)
-    assert config.source.overlaid(config, {"knee": "ideal"}) == {
+    assert config.source.override_actuators(config, {"knee": "ideal"}) == {
         "hip_p & hip_v": lag,
         "knee": "ideal",
     }
