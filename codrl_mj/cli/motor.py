@@ -93,7 +93,7 @@ class List:
 
     def run(self) -> tuple[int, Any]:
         """Print the table."""
-        from codrl_mj.catalogue.datasheet import KINDS
+        from codrl_mj.catalogue.datasheet import QUANTITY_SPECS
         from codrl_mj.catalogue.derivation import PRINTED_NAMES
         from codrl_mj.sizing import catalogue_rows
         from codrl_mj.sizing.limits import LIMIT_UNITS
@@ -118,8 +118,8 @@ class List:
         )
         print_text("at: nominal voltage. –: not on the datasheet; the voltage is then 24 V.")
         print("codrl-mj motor show NAME gives the source of each number")
-        kinds = {name: KINDS.get(PRINTED_NAMES.get(name, name)) for name in rows[0]}
-        units = LIMIT_UNITS | {name: kind.unit for name, kind in kinds.items() if kind is not None}
+        specs = {name: QUANTITY_SPECS.get(PRINTED_NAMES.get(name, name)) for name in rows[0]}
+        units = LIMIT_UNITS | {name: spec.unit for name, spec in specs.items() if spec is not None}
         return 0, {"units": units, "motors": rows}
 
 

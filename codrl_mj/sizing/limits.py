@@ -16,7 +16,7 @@ import numpy as np
 
 from codrl_mj.actuators import Drive, GearMotor, Servo, ServoLoop, override_actuator, resolve
 from codrl_mj.catalogue import MotorEntry, MotorParameters, motor_entry, motor_names
-from codrl_mj.catalogue.datasheet import KINDS
+from codrl_mj.catalogue.datasheet import QUANTITY_SPECS
 from codrl_mj.catalogue.derivation import PRINTED_NAMES
 from codrl_mj.fields import check_names
 
@@ -357,7 +357,11 @@ def describe_motor(
     return report | {
         **{name: getattr(entry, name) for name in ("manufacturer", "product", "kind")},
         "numbers": [
-            _value(name, getattr(entry.parameters, name), KINDS[PRINTED_NAMES.get(name, name)].unit)
+            _value(
+                name,
+                getattr(entry.parameters, name),
+                QUANTITY_SPECS[PRINTED_NAMES.get(name, name)].unit,
+            )
             | {
                 "how": derived[name],
                 "sources": value_sources,

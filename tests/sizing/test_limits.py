@@ -26,7 +26,7 @@ def test_stall_and_no_load_agree_with_the_datasheet(name):
     entry = motor_entry(name)
     can, printed = (
         drive_limits(Drive.from_motor_parameters(entry.parameters)),
-        entry.datasheet.readings(),
+        entry.datasheet.parsed_values(),
     )
     ratio = entry.parameters.gear_ratio
     for field, ours in (("stall_torque", can.stall_torque), ("no_load_speed", can.no_load_speed)):
