@@ -164,7 +164,7 @@ def to_si(
         unit: unit of the number, spelled as in datasheets and logs.
         si_unit: SI unit of the quantity; None for any quantity.
         quantity_name: name of the quantity, for messages.
-        mass_as_weight: True to read a mass as its weight if a force is required, as in kg*cm and oz*in.
+        mass_as_weight: True to read a mass as a weight where a force is required, as in kg*cm.
 
     Raises:
         ValueError: the unit is unknown or does not fit; the caller adds the remedy.

@@ -95,7 +95,7 @@ class Plan(NamedTuple):
     # The option of the lowest rate whose errors are below all goals by `MARGIN`, or else the option
     # that comes closest.
     best: Option
-    missed: list[str]  # parameters whose goals the best option misses
+    missed_goals: list[str]  # parameters whose goals the best option misses
     unknown: list[str]  # parameters that are 0 on the datasheet, so that no error can be expected
 
 
@@ -152,8 +152,8 @@ def plan(
         else min(options, key=lambda choice: choice.worst)
     )
     names = [name for name in GOALS if truth[name] > 0.0]
-    missed = [name for name in names if best.errors.get(name, math.inf) > GOALS[name]]
-    return Plan(options, best, missed, [name for name in GOALS if name not in names])
+    missed_goals = [name for name in names if best.errors.get(name, math.inf) > GOALS[name]]
+    return Plan(options, best, missed_goals, [name for name in GOALS if name not in names])
 
 
 def write_excitation(path: Path, option: Option) -> None:

@@ -83,7 +83,9 @@ def _sampled(actuator: CurrentLoopActuator, timestep: float | None) -> _Sampled:
                 2.0 * math.pi * (actuator.controller.bandwidth or DEFAULT_BANDWIDTH * rate)
             )
         decay = math.exp(-resistance * period / inductance)
-        input_gain = -math.expm1(-resistance * period / inductance) / resistance  # [A/V] in a sample
+        input_gain = (
+            -math.expm1(-resistance * period / inductance) / resistance
+        )  # [A/V] in a sample
         numerator = np.array([input_gain * (kp + ki * period), -input_gain * kp])
         delay = [1.0, 0.0] if actuator.controller.delayed else [1.0]
         denominator = np.polymul(np.polymul([1.0, -decay], [1.0, -1.0]), delay)

@@ -99,7 +99,7 @@ class Scores:
         }
 
     def stratum(self, contrasts: Sequence[Contrast]) -> Stratum | None:
-        """Return the scores of one task's contrasts, averaged by seed; None if a group has < 2 seeds.
+        """Return the scores of one task's contrasts, averaged by seed; None with < 2 seeds.
 
         Contrasts may share policies, so that only different seeds are independent. Therefore each
         seed contributes one mean over all contrasts, and only if it was tested in all of them.
@@ -141,9 +141,7 @@ class Verdict(NamedTuple):
 
     @property
     def outcome(self) -> Literal["yes", "no", "the other way", "open", "not judged"]:
-        """Answer to the question; `no` is possible only for `equivalent`: the interval lies beyond
-        the margin.
-        """
+        """Answer; `no` only for `equivalent`, if the whole interval lies beyond the margin."""
         if np.isnan(self.p):
             return "not judged"
         if self.corrected_p < LEVEL:

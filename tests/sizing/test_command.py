@@ -103,7 +103,7 @@ def test_show_accepts_a_custom_datasheet_and_any_drive(capsys):
     text = printed_by(capsys, "show", "own.toml", "--out", ".")
     parts = (
         "we ours, brushed",
-        "DriveLimits at its output, at 12 V",
+        "Limits at the output, at 12 V",
         "assumed",
         "The motor, at its rotor",
         "source 1",

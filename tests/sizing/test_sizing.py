@@ -249,7 +249,7 @@ def test_friction_and_damping_raise_the_supply_of_a_swing_up(pendulum):
     rough = dataclasses.replace(PAPER, coulomb_friction=0.1)
     assert min_energy_gain(pendulum.swing, drive(rough, 5.5)) < light
     assert min_energy_gain(pendulum.swing._replace(damping=0.05), drive(voltage=5.5)) < light
-    assert min_pumped_energy(pendulum.swing._replace(largest=6.0), drive()) == math.inf
+    assert min_pumped_energy(pendulum.swing._replace(max_torque=6.0), drive()) == math.inf
 
 
 def test_a_surely_sufficient_motor_does_not_change_the_run(pendulum):
