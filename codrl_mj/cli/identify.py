@@ -377,8 +377,8 @@ class PlanExperiment:
         )
         if experiments.missed_goals:
             print_text(
-                f"it misses the goals of {', '.join(experiments.missed_goals)}: use a larger current,"
-                " a longer log, or other sensors"
+                f"it misses the goals of {', '.join(experiments.missed_goals)}: use a larger"
+                " current, a longer log, or other sensors"
             )
         if experiments.unknown:
             print_text(

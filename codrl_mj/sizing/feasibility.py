@@ -234,7 +234,7 @@ def feasibility(
     for name, formula, load, available, unit, verdicts, remedy in conditions:
         needed = float(np.max(load))
         holds = needed <= available
-        # Heat grows with the square of the current: 10 times the heat is sqrt(10) times the current.
+        # Heat grows with the squared current: 10 times the heat is sqrt(10) times the current.
         verdict, hopeless_limit = (
             verdicts[not holds],
             available * (math.sqrt(HOPELESS_RATIO) if name == "heat" else HOPELESS_RATIO),
