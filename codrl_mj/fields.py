@@ -334,7 +334,7 @@ def build(cls: type, mapping: object, label: str, prefix: str = "") -> Any:
             f"{label} {prefix.rstrip('.')!r} = {mapping!r}: must be a mapping of {cls.__name__}'s"
             " fields"
         )
-    nested = parts(cls)
+    nested = nested_types(cls)
     absent = {
         field.name: field.metadata["absent"]
         for field in dataclasses.fields(cls)
@@ -361,13 +361,13 @@ def build(cls: type, mapping: object, label: str, prefix: str = "") -> Any:
     return cls(**{key: convert(key, value) for key, value in mapping.items()})
 
 
-def part(absent: Any) -> Any:
-    """Return a field for an optional nested dataclass; with None, the values of `absent` apply."""
+def optional_nested(absent: Any) -> Any:
+    """Return a field for an optional nested dataclass; None, the default, stands for `absent`."""
     return dataclasses.field(default=None, metadata={"absent": absent})
 
 
-def parts(cls: type) -> dict[str, type]:
-    """Return the nested dataclasses of a dataclass by field."""
+def nested_types(cls: type) -> dict[str, type]:
+    """Return field -> class, for the nested dataclasses of a dataclass."""
     types_by_name = {}
     for field in dataclasses.fields(cls):
         if "absent" in field.metadata:
@@ -378,14 +378,14 @@ def parts(cls: type) -> dict[str, type]:
 
 
 @functools.cache
-def declared_parts(cls: Any) -> dict[str, Any]:
-    """Return field -> annotated type, for fields of `parts` annotated with a class or a union."""
+def declared_nested_types(cls: Any) -> dict[str, Any]:
+    """Return field -> declared type, for nested dataclasses declared as a class or a union."""
     # Names that only a type checker imports cannot be resolved at run time.
     try:
         hints = typing.get_type_hints(cls)
     except NameError:
         return {}
-    declared = {name: hints[name] for name in parts(cls) if hints[name] is not Any}
+    declared = {name: hints[name] for name in nested_types(cls) if hints[name] is not Any}
     return {
         name: hint for name, hint in declared.items() if isinstance(hint, type | types.UnionType)
     }

@@ -91,7 +91,7 @@ def registered_plugins() -> dict[str, tuple[int, Any]]:
 
 
 def check_structure(plugins: dict[str, tuple[int, Any]]) -> None:
-    """Compare `Plugin` with the structure that MuJoCo itself filled for `mujoco.pid`; raise."""
+    """Raise if `Plugin` does not describe the structure that MuJoCo filled for `mujoco.pid`."""
     pid = plugins["mujoco.pid"][1] if "mujoco.pid" in plugins else Plugin()
     attributes = (
         {pid.attributes[index] for index in range(pid.nattribute)}

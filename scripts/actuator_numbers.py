@@ -22,7 +22,7 @@ import codrl_mj
 from codrl_mj.actuators import NAMED, Drive
 from codrl_mj.catalogue import motor_entry, motor_names
 from codrl_mj.runs.files import atomic_write
-from codrl_mj.sizing import design, find_drive, torque_limits
+from codrl_mj.sizing import analyze_loop, find_drive, torque_limits
 from codrl_mj.study.bench import BLOCKED_INERTIA, make_bench
 from codrl_mj.tasks import PAPER_TASKS, named_actuator
 from codrl_mj.validation.motor_catalogue import NO_HEATING
@@ -100,7 +100,7 @@ def _on_a_slide(task: str) -> bool:
 def motor_row(name: str) -> dict[str, Any]:
     """Measure a motor of the catalogue, cold, at its nominal voltage (or 24 V) and its own gear."""
     drive, numbers = find_drive(name), motor_entry(name).parameters
-    loop = design(drive)
+    loop = analyze_loop(drive)
     # Stall and no load are properties of the motor, so the controller does not limit the current.
     cold = dataclasses.replace(drive.motor, **NO_HEATING)
     free = dataclasses.replace(

@@ -21,7 +21,7 @@ from codrl_mj.evaluation import evaluate
 from codrl_mj.identify import Log, identify, read_log
 from codrl_mj.identify.synthetic import Excitation, Sampler, Sensor, simulate, write_log
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.sizing.abilities import find_drive
+from codrl_mj.sizing.limits import find_drive
 from codrl_mj.training import TrainConfig, train
 
 TASK, EPISODES, TEST_SEED = "pendulum", 20, 3_000_000

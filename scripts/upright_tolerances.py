@@ -46,7 +46,7 @@ def row(name: str, study: ActuatorStudy) -> dict[str, object]:
     step = find_task("pendulum").step_duration
     num_held = round(GOAL_HOLD / step) + 1
     worst: list[np.ndarray] = []
-    tests = study.grid.deployments
+    tests = study.grid.policy_tests
     policies = [tests[f"pendulum: {name}", seed] for seed in range(study.seeds)]
     policies = [test for test in policies if finished(test.run)]
     for test in policies:

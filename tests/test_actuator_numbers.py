@@ -110,7 +110,7 @@ def test_every_motor_of_the_catalogue_agrees_with_its_datasheet_in_the_engine(na
     """The datasheet's values hold to 5 %, values from its constants to 0.2 %."""
     entry, row = motor_entry(name), SCRIPT.motor_row(name)
     check_row(next(row for row in read_table("motors") if row["motor"] == name), row)
-    numbers, printed = entry.parameters, entry.datasheet.readings()
+    numbers, printed = entry.parameters, entry.datasheet.parsed_values()
     ratio, torque_per_current = (
         numbers.gear_ratio,
         (numbers.gear_efficiency or 1.0) * numbers.torque_constant,

@@ -17,8 +17,8 @@ from codrl_mj.fields import (
     did_you_mean,
     flag,
     integer,
-    part,
-    parts,
+    nested_types,
+    optional_nested,
     positive_integers,
     positive_reals,
     real,
@@ -180,7 +180,7 @@ class Outer(Checked):
 
     size: int = integer(1, minimum=1)
     always: Inner = Inner()
-    maybe: Inner | None = part(Inner())
+    maybe: Inner | None = optional_nested(Inner())
 
 
 @given(st.floats(0, 10), st.integers(1, 9), st.none() | st.floats(0, 10))
@@ -197,8 +197,8 @@ def test_nested_mappings_build_dataclasses(gain, size, maybe_gain):
 
 
 def test_parts_are_the_fields_with_dataclasses():
-    assert parts(Outer) == {"always": Inner, "maybe": Inner}
-    assert parts(Inner) == {}
+    assert nested_types(Outer) == {"always": Inner, "maybe": Inner}
+    assert nested_types(Inner) == {}
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import numpy as np
 
 from codrl_mj.actuators import noise, stability
 from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, UnstableError
-from codrl_mj.fields import Checked, flag, integer, part, real
+from codrl_mj.fields import Checked, flag, integer, optional_nested, real
 
 
 @dataclasses.dataclass(frozen=True)
@@ -285,9 +285,8 @@ class DCMotorActuator(ActuatorModel):
     """The motor and its arm."""
     controller: CurrentLoop = CurrentLoop()
     """The current loop and its sensor."""
-    supply: Supply | None = part(Supply())
-    """Supply of the drive. None: an ideal supply; only `controller.max_voltage` limits the voltage.
-    """
+    supply: Supply | None = optional_nested(Supply())
+    """Supply of the drive; None: `controller.max_voltage` at any current."""
 
     @property
     def arm_radius(self) -> float:

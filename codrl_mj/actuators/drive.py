@@ -22,7 +22,7 @@ from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, JointAdditi
 from codrl_mj.actuators.parameters import parameters_type
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
 from codrl_mj.actuators.shaft import Shaft, StepAverages, TemperatureRises, Winding
-from codrl_mj.fields import part
+from codrl_mj.fields import optional_nested
 
 
 class State(NamedTuple):
@@ -218,8 +218,8 @@ class Drive(ActuatorModel):
     """The motor and its gear."""
     controller: SampledLoop = SampledLoop()
     """The current loop."""
-    supply: Supply | None = part(Supply(voltage=24.0))
-    """Supply of the drive. None: an ideal supply of 24 V."""
+    supply: Supply | None = optional_nested(Supply(voltage=24.0))
+    """Supply of the drive; None: 24 V without a resistance."""
 
     @classmethod
     def from_motor_parameters(cls, parameters: Any) -> "Drive":

@@ -152,11 +152,11 @@ class ActuatorModel(fields.Checked):
         """Validate."""
         super().__post_init__()
         family: Any = type(self)
-        kinds = fields.declared_parts(family)
+        kinds = fields.declared_nested_types(family)
         for field in dataclasses.fields(self) if kinds else ():
             value = getattr(self, field.name)
             if value is not field.default and not isinstance(value, kinds.get(field.name, object)):
-                kind = fields.parts(family)[field.name].__name__
+                kind = fields.nested_types(family)[field.name].__name__
                 raise ValueError(
                     f"{family.__name__}.{field.name} = {value!r}: must be a {kind}; to build one"
                     f" from nested mappings use {family.__name__}.from_mapping"
@@ -171,7 +171,7 @@ class ActuatorModel(fields.Checked):
         The function must be pure and written in plain Python that numba can compile unchanged.
 
         Args:
-            parameters: named tuple of floats: all fields by name, including those of nested parts.
+            parameters: named tuple of floats: all fields by name, including nested ones.
             timestep: mechanical step [s].
             state: `State` after the previous step.
             inputs: inputs that are held over the step.

@@ -49,8 +49,8 @@ def to_field_type(cls: type, name: str, value: Any) -> Any:
 
 
 def from_values(cls: type, values: Mapping[str, Any], prefix: str = "") -> Any:
-    """Build a dataclass from values by dotted path; an optional part with its defaults is None."""
-    nested, values_by_field = fields.parts(cls), {}
+    """Build a dataclass from values by dotted path; nested ones equal to their default are None."""
+    nested, values_by_field = fields.nested_types(cls), {}
     for field in _fields(cls).values():
         if field.name in nested:
             inner = from_values(nested[field.name], values, f"{prefix}{field.name}.")
@@ -80,7 +80,7 @@ def from_array(cls: Any, values: Iterable[float]) -> Any:
 @functools.cache
 def _outline(cls: Any) -> tuple[tuple[str, Any], ...]:
     """Return the fields of a dataclass, each with the class of a nested part or with None."""
-    part_types = fields.parts(cls)
+    part_types = fields.nested_types(cls)
     return tuple((field.name, part_types.get(field.name)) for field in _fields(cls).values())
 
 
@@ -89,7 +89,7 @@ def choices_of(cls: type, path: str) -> tuple[str, ...]:
     owner: Any = cls
     for name in path.split("."):
         field = next(field for field in dataclasses.fields(owner) if field.name == name)
-        owner = fields.parts(owner).get(name)
+        owner = fields.nested_types(owner).get(name)
     words: tuple[str, ...] = field.metadata.get("options", ())
     return words
 
@@ -101,7 +101,7 @@ def is_arm(path: str) -> bool:
 
 @functools.cache
 def field_paths(cls: type) -> tuple[str, ...]:
-    """Return the dotted paths of all fields of a family, including those of nested parts."""
+    """Return the dotted paths of all fields of a family, including nested ones."""
     inner = (
         [f"{name}.{path}" for path in field_paths(part)] if part else [name]
         for name, part in _outline(cls)

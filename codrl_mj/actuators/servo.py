@@ -119,7 +119,7 @@ class Signals(NamedTuple):
     temperature_saturated: float
     """1 if `max_temperature` limited the current to less than `max_current`."""
     electrical_power: float
-    """Mean electrical power [W] into the winding."""
+    """Mean of voltage times current at the winding's terminals [W]."""
     copper_loss: float
     """Mean heat [W] in the winding."""
 
@@ -253,13 +253,13 @@ class Servo(Drive):
         )
         return float(f"{10.0 * slope:.3g}")
 
-    def with_default_gain(self, loop: Mapping[str, Any]) -> "Servo":
-        """Return this servo with `default_velocity_gain`, unless `loop` has a `velocity_gain`.
+    def with_default_gain(self, loop_fields: Mapping[str, Any]) -> "Servo":
+        """Return this servo with `default_velocity_gain`, unless `loop_fields` set a velocity gain.
 
         Raises:
             ValueError: the motor has no back-EMF, so there is no default gain.
         """
-        if "velocity_gain" in loop:
+        if "velocity_gain" in loop_fields:
             return self
         if not self.default_velocity_gain:
             raise ValueError(

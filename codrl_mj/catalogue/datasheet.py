@@ -8,15 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from codrl_mj.catalogue.derivation import MotorParameters, derive
-from codrl_mj.catalogue.units import Kind, parse_value
+from codrl_mj.catalogue.units import QuantitySpec, parse_value
 from codrl_mj.fields import check_names, command
 from codrl_mj.user_code import asset_folder, read_text
 
 
-def _printed(unit: str, example: str, power: int = 0, zero: bool = False, also: str = "") -> Any:
-    """Return a field for a printed value; `also` lists other common names of it."""
+def _printed(
+    unit: str, example: str, gear_exponent: int = 0, allow_zero: bool = False, synonyms: str = ""
+) -> Any:
+    """Return a field for a printed value; `synonyms` are its other common names."""
     return dataclasses.field(
-        default=None, metadata={"kind": Kind(unit, example, power, zero), "also": also}
+        default=None,
+        metadata={
+            "spec": QuantitySpec(unit, example, gear_exponent, allow_zero),
+            "synonyms": synonyms,
+        },
     )
 
 
@@ -39,29 +45,32 @@ class Datasheet:
     """
 
     shaft: str | None = None
-    """Shaft of the mechanical values: `motor`, or `output`, behind the gear; required with a gear.
+    """Shaft at which torques, speeds, inertias and friction are stated: `motor`, or `output` behind
+    the gear; required with a gear.
     """
-    nominal_voltage: str | None = _printed("V", "12 V", also="voltage rated_voltage")
+    nominal_voltage: str | None = _printed("V", "12 V", synonyms="voltage rated_voltage")
     """Voltage at which the values below are stated."""
-    stall_torque: str | None = _printed("N*m", "2.42 N*m", -1, also="starting_torque")
-    """Torque of the blocked shaft, already without friction."""
-    stall_current: str | None = _printed("A", "133 A", also="starting_current")
+    stall_torque: str | None = _printed("N*m", "2.42 N*m", -1, synonyms="starting_torque")
+    """Torque of the blocked shaft, net of friction."""
+    stall_current: str | None = _printed("A", "133 A", synonyms="starting_current")
     """Current of the blocked motor."""
     no_load_speed: str | None = _printed("rad/s", "5310 rpm", 1)
     """Speed without load."""
-    no_load_current: str | None = _printed("A", "2.7 A", zero=True)
+    no_load_current: str | None = _printed("A", "2.7 A", allow_zero=True)
     """Current without load, which overcomes the friction."""
     continuous_torque: str | None = _printed(
-        "N*m", "91.1 mN*m", -1, also="rated_torque nominal_torque"
+        "N*m", "91.1 mN*m", -1, synonyms="rated_torque nominal_torque"
     )
     """Torque that the motor can deliver permanently; often called nominal or rated."""
-    continuous_current: str | None = _printed("A", "2.52 A", also="rated_current nominal_current")
+    continuous_current: str | None = _printed(
+        "A", "2.52 A", synonyms="rated_current nominal_current"
+    )
     """Current that the motor can carry permanently."""
     continuous_speed: str | None = _printed(
-        "rad/s", "5170 rpm", 1, also="rated_speed nominal_speed"
+        "rad/s", "5170 rpm", 1, synonyms="rated_speed nominal_speed"
     )
     """Speed at the nominal voltage and the continuous current."""
-    peak_current: str | None = _printed("A", "24 A", also="max_current")
+    peak_current: str | None = _printed("A", "24 A", synonyms="max_current")
     """Largest current of the motor or the drive."""
     resistance: str | None = _printed("ohm", "0.464 ohm")
     """Resistance between the terminals."""
@@ -69,11 +78,11 @@ class Datasheet:
     """Inductance between the terminals."""
     electrical_time_constant: str | None = _printed("s", "0.5 ms")
     """Inductance over resistance."""
-    torque_constant: str | None = _printed("N*m/A", "25.1 mN*m/A", -1, also="kt")
+    torque_constant: str | None = _printed("N*m/A", "25.1 mN*m/A", -1, synonyms="kt")
     """Torque per current; at the output, for a gear without losses."""
-    back_emf_constant: str | None = _printed("V*s/rad", "0.56 mV/rpm", -1, also="ke")
+    back_emf_constant: str | None = _printed("V*s/rad", "0.56 mV/rpm", -1, synonyms="ke")
     """Voltage per speed."""
-    speed_constant: str | None = _printed("rad/s/V", "380 rpm/V", 1, also="kv")
+    speed_constant: str | None = _printed("rad/s/V", "380 rpm/V", 1, synonyms="kv")
     """Speed per voltage, Kv."""
     rotor_inertia: str | None = _printed("kg*m^2", "135 g*cm^2", -2)
     """Inertia of the rotor; at the output, the reflected inertia (`armature`). With `shaft =
@@ -81,14 +90,14 @@ class Datasheet:
     """
     mechanical_time_constant: str | None = _printed("s", "9.92 ms")
     """Time constant of the speed after a step of voltage without load: R*J/(kT*kE)."""
-    gear_ratio: str | float | None = _printed("", "30", also="gear reduction")
+    gear_ratio: str | float | None = _printed("", "30", synonyms="gear reduction")
     """Turns of the motor per turn of the output."""
     gear_efficiency: str | float | None = _printed("", "0.74")
     """Share of the torque that the gear transmits."""
-    coulomb_friction: str | None = _printed("N*m", "0.12 mN*m", -1, zero=True)
-    """Friction torque at any speed."""
-    viscous_friction: str | None = _printed("N*m*s/rad", "1.5e-4 N*m*s/rad", -2, zero=True)
-    """Friction torque per speed."""
+    coulomb_friction: str | None = _printed("N*m", "0.12 mN*m", -1, allow_zero=True)
+    """Coulomb friction: the torque that opposes motion at any speed."""
+    viscous_friction: str | None = _printed("N*m*s/rad", "1.5e-4 N*m*s/rad", -2, allow_zero=True)
+    """Viscous friction: the torque that opposes motion, per speed."""
     thermal_resistance: str | None = _printed("K/W", "9.85 K/W")
     """Thermal resistance from winding to ambient, if it is printed as one value."""
     thermal_resistance_winding: str | None = _printed("K/W", "8.28 K/W")
@@ -106,31 +115,31 @@ class Datasheet:
         """Parse every value, so that an invalid one raises an error at once."""
         if self.shaft not in (None, "motor", "output"):
             raise ValueError(f"datasheet.shaft = {self.shaft!r}: must be motor or output")
-        self.readings()
+        self.parsed_values()
 
-    def readings(self) -> dict[str, Any]:
-        """Return the printed values, each a `Reading` in the SI unit of its field at its shaft.
+    def parsed_values(self) -> dict[str, Any]:
+        """Return the printed values as `ParsedValue`, each in SI units at its stated shaft.
 
         Raises:
             ValueError: a value has no unit or a wrong one, is not positive, or an efficiency
                 exceeds 1; or the shaft of a value is not stated although there is a gear.
         """
-        printed_values = {name: getattr(self, name) for name in KINDS}
-        readings = {
-            name: parse_value(name, printed, KINDS[name])
+        printed_values = {name: getattr(self, name) for name in QUANTITY_SPECS}
+        parsed_values = {
+            name: parse_value(name, printed, QUANTITY_SPECS[name])
             for name, printed in printed_values.items()
             if printed is not None
         }
         ambiguous = [
             name
-            for name, reading in readings.items()
-            if KINDS[name].power and reading.shaft is None
+            for name, reading in parsed_values.items()
+            if QUANTITY_SPECS[name].gear_exponent and reading.shaft is None
         ]
         if (
             self.shaft is None
             and ambiguous
-            and "gear_ratio" in readings
-            and readings["gear_ratio"].value != 1.0
+            and "gear_ratio" in parsed_values
+            and parsed_values["gear_ratio"].value != 1.0
         ):
             raise ValueError(
                 f"datasheet.shaft is missing: {', '.join(ambiguous)} may be before or behind the"
@@ -138,7 +147,7 @@ class Datasheet:
                 f'{self.gear_ratio}; write shaft = "motor" or shaft = "output", or "... at motor"'
                 " in a single value"
             )
-        inertia, ratio = readings.get("rotor_inertia"), readings.get("gear_ratio")
+        inertia, ratio = parsed_values.get("rotor_inertia"), parsed_values.get("gear_ratio")
         if (
             self.shaft == "output"
             and inertia
@@ -147,38 +156,36 @@ class Datasheet:
             and ratio.value != 1.0
         ):
             raise ValueError(
-                f"datasheet.rotor_inertia = {self.rotor_inertia!r}: the inertia of the rotor, or"
-                " the one seen at the output, "
-                'gear_ratio^2 times that? shaft = "output" is ambiguous: write'
-                f' "{inertia.printed} at motor" (what '
-                f'motors\' datasheets print) or "{inertia.printed} at output" (reflected, an'
-                " armature)"
+                f'datasheet.rotor_inertia = {self.rotor_inertia!r}: shaft = "output" does not tell'
+                " if this is the rotor's own inertia, or the reflected one, gear_ratio^2 times"
+                f' that: write "{inertia.printed} at motor" (own inertia, as datasheets of motors'
+                f' print it) or "{inertia.printed} at output" (reflected inertia, an armature)'
             )
         default_shaft = self.shaft or "motor"
-        readings = {
+        parsed_values = {
             name: reading._replace(shaft=reading.shaft or default_shaft)
-            for name, reading in readings.items()
+            for name, reading in parsed_values.items()
         }
-        if "gear_efficiency" in readings and readings["gear_efficiency"].value > 1.0:
+        if "gear_efficiency" in parsed_values and parsed_values["gear_efficiency"].value > 1.0:
             raise ValueError(
                 f"datasheet.gear_efficiency = {self.gear_efficiency!r}: must be a finite number > 0"
                 ' and <= 1; write percent as "74 %"'
             )
-        return readings
+        return parsed_values
 
     def parameters(self, strict: bool = True, tolerance: float = 0.2) -> MotorParameters:
         """Return the motor's parameters in SI units; see `from_datasheet`."""
-        return derive(self.readings(), KINDS, strict, tolerance)
+        return derive(self.parsed_values(), QUANTITY_SPECS, strict, tolerance)
 
 
-KINDS: dict[str, Kind] = {
-    f.name: f.metadata["kind"] for f in dataclasses.fields(Datasheet) if "kind" in f.metadata
+QUANTITY_SPECS: dict[str, QuantitySpec] = {
+    f.name: f.metadata["spec"] for f in dataclasses.fields(Datasheet) if "spec" in f.metadata
 }
-"""Printed fields and the quantities that they hold."""
+"""Name -> quantity, for all fields of `Datasheet` with printed values."""
 _FIELD_BY_OTHER_NAME = {
     other_name: f.name
     for f in dataclasses.fields(Datasheet)
-    for other_name in f.metadata.get("also", "").split()
+    for other_name in f.metadata.get("synonyms", "").split()
 }
 _PHASE = (
     "write the value between two phases: twice that of a phase for a star, two thirds for a delta"
@@ -194,7 +201,7 @@ _UNSUPPORTED = {
 
 
 def to_field_names(printed: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert names of printed values, in any case and with common synonyms, to names of fields.
+    """Convert names of printed values (in any case, also common synonyms) to names of fields.
 
     Raises:
         ValueError: a name is unknown, or a field has two values.
@@ -205,8 +212,8 @@ def to_field_names(printed: Mapping[str, Any]) -> dict[str, Any]:
         if field in _UNSUPPORTED:
             raise ValueError(f"datasheet.{name}: {_UNSUPPORTED[field]}")
         check_names(
-            [field if field in ("shaft", *KINDS) else name],
-            ("shaft", *KINDS),
+            [field if field in ("shaft", *QUANTITY_SPECS) else name],
+            ("shaft", *QUANTITY_SPECS),
             "datasheet field",
             list_all=True,
         )
@@ -234,9 +241,9 @@ def from_datasheet(
         strict: raise if the datasheet contradicts itself; False: only list the contradictions in
             `disagreements`.
         tolerance: relative difference above which two values contradict each other. 0.2 accepts
-            what makers round, or print for a warm motor or for saturated iron, and detects wrong
-            units.
-        printed: the fields of `Datasheet`.
+            rounded values, and values of a warm motor or of saturated iron; wrong units differ by
+            more.
+        **printed: fields of `Datasheet`.
 
     Raises:
         ValueError: a field is unknown, has no unit or a wrong one, or is out of bounds; the fields
@@ -309,8 +316,8 @@ def motor_entry(name: str) -> MotorEntry:
     """Return a motor of the catalogue, or of a file.
 
     Args:
-        name: one of `motor_names()`, or the path of a custom TOML file, in which [datasheet] is
-            sufficient.
+        name: one of `motor_names()`, or the path of a custom TOML file, which needs only
+            the table [datasheet].
 
     Raises:
         ValueError: there is no such motor (the message suggests the nearest); the file lacks an
@@ -333,7 +340,7 @@ def motor_entry(name: str) -> MotorEntry:
 
 
 def _entry(name: str, content: dict[str, Any], is_custom: bool) -> MotorEntry:
-    """Return the motor described by a file; a custom file need not state maker and sources."""
+    """Return the motor described by a file; a custom file may omit manufacturer and sources."""
     optional: dict[str, Any] = {"estimated": {}, "notes": "", "tolerance": 0.2}
     if is_custom:
         optional |= {"manufacturer": "", "product": name, "kind": "", "sources": {}}
@@ -360,7 +367,9 @@ def _entry(name: str, content: dict[str, Any], is_custom: bool) -> MotorEntry:
     # The parameters are derived now, so that an invalid file is rejected when it is read.
     _ = MotorEntry(**content).parameters
     check_names(content["estimated"], printed, "entry", "estimated.")
-    printed_names = [key for key in printed if key in KINDS and key not in content["estimated"]]
+    printed_names = [
+        key for key in printed if key in QUANTITY_SPECS and key not in content["estimated"]
+    ]
     if content["sources"] or not is_custom:
         content["sources"] = _sources(content["sources"], printed_names)
     return MotorEntry(**content)

@@ -2,8 +2,8 @@
 
 The motor is V = R*I + kE*w with torque kT*I. The gear transmits the share `gear_efficiency` of this
 torque. Friction is subtracted behind the gear, as in the simulation, so without load it equals
-gear_efficiency*kT*I0. Source of the relations: maxon's *Key information on maxon DC and EC motors*;
-they are those of any textbook on DC motors.
+gear_efficiency*kT*I0. Source: maxon's *Key information on maxon DC and EC motors*; textbooks on DC
+motors have the same relations.
 """
 
 import dataclasses
@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from types import CodeType
 from typing import Any, NamedTuple
 
-from codrl_mj.catalogue.units import Kind, Reading
+from codrl_mj.catalogue.units import ParsedValue, QuantitySpec
 
 NAME = r"[a-z]\w+"
 """Pattern of a quantity in a formula."""
@@ -21,12 +21,13 @@ NAME = r"[a-z]\w+"
 
 @functools.cache
 def compile_formula(formula: str) -> CodeType:
-    """Return a compiled formula of known quantities; its `co_names` are those that it needs."""
+    """Return a compiled formula; its `co_names` are the names of the quantities in it."""
     return compile(formula, "a rule of the catalogue", "eval")
 
 
-# Each rule is a quantity and a formula for it. The first rule whose quantities are known is
-# applied. Torques at the output, behind the losses of a gear, have their own names.
+# Each rule is a quantity and a formula for it. `apply_rules` applies the first rule for a missing
+# quantity whose formula can be evaluated, so the order of the rules is their priority. Torques at
+# the output include the losses of the gear, and therefore have names of their own.
 RULES = (
     ("resistance", "nominal_voltage / stall_current"),
     (
@@ -90,8 +91,8 @@ _LOAD = (
     " motors give less"
 )
 _SPEED = (
-    "iron losses and brushes are not in the model; many print a warm motor's speed, or a limit of"
-    " the drive"
+    "iron losses and brushes are not in the model; many makers print a warm motor's speed, or a"
+    " limit of the drive"
 )
 CHECKS = (
     # A printed quantity, its value according to the derived numbers, and an explanation of a
@@ -100,8 +101,8 @@ CHECKS = (
         "torque_constant",
         "back_emf_constant",
         (
-            "equal in SI for an ideal motor. A smaller torque constant is lost in iron, or"
-            " saturates at stall; a larger one would make energy: distrust the stall torque, or the"
+            "equal in SI for an ideal motor. Iron losses, or saturation at stall, make the torque"
+            " constant smaller; a larger one would create energy: distrust the stall torque, or the"
             " conventions of current and voltage"
         ),
     ),
@@ -144,7 +145,7 @@ CHECKS = (
     (
         "mechanical_time_constant",
         "resistance * rotor_inertia / (torque_constant * back_emf_constant)",
-        "rounding; some print it with a gear's or an encoder's inertia",
+        "rounding; some makers include the inertia of a gear or an encoder",
     ),
     (
         "electrical_time_constant",
@@ -162,26 +163,26 @@ CHECKS = (
     (
         "thermal_resistance",
         "thermal_resistance_winding + thermal_resistance_housing",
-        "the housing's depends on what it is mounted on",
+        "that of the housing depends on its mounting",
     ),
 )
 
 
 class Disagreement(NamedTuple):
-    """Disagreement of a printed value, or of a torque constant of any origin, with other values."""
+    """Difference between a printed value (or any torque constant) and its value from others."""
 
     quantity: str
     """Name of the field."""
     printed: float
     """Printed value [unit]."""
     computed: float
-    """Value computed from the derived numbers [unit]."""
+    """Value computed from the other numbers [unit]."""
     unit: str
     """SI unit of both values."""
     formula: str
     """Formula of the computed value."""
     explanation: str
-    """Explanation of a difference."""
+    """Common reasons for such a difference."""
 
     @property
     def difference(self) -> float:
@@ -225,7 +226,7 @@ class MotorParameters:
     max_current: float | None
     """Largest current of the motor or the drive [A]."""
     continuous_current: float | None
-    """Permanently permitted current [A]."""
+    """Current that the motor can carry permanently [A]."""
     voltage: float | None
     """Nominal supply voltage [V]."""
     thermal_resistance: float | None
@@ -241,15 +242,16 @@ class MotorParameters:
     max_temperature: float | None
     """Largest permissible temperature of the winding [degC]."""
     derived: Mapping[str, str]
-    """Origin of every known number above."""
+    """Parameter -> sentence on its origin, for every known parameter."""
     disagreements: tuple[Disagreement, ...]
-    """Printed values that also follow from others but differ by more than 1e-9, the largest first.
+    """Differences above 1e-9 between printed values and values computed from others, the largest
+    first.
     """
 
 
 AT_OUTPUT = ("stall_torque_at_output", "continuous_torque_at_output", "torque_constant_at_output")
-"""Torques and torque constant behind a gear's losses. They give the motor's values only if its
-efficiency is known.
+"""Torques and torque constant that include a gear's losses. The motor's own values follow from them
+only if the efficiency of the gear is known.
 """
 _MIN_EFFICIENCY = 0.2
 """Lower limit of a derived efficiency. No off-the-shelf servo gear is worse, so a lower value
@@ -260,7 +262,7 @@ PRINTED_NAMES = {
     "voltage": "nominal_voltage",
     "max_temperature": "max_winding_temperature",
 }
-"""Parameters whose printed field has another name."""
+"""Parameter -> field of the datasheet, where their names differ."""
 _NEEDED = {
     "resistance": "resistance, or nominal_voltage and stall_current",
     "torque_constant": (
@@ -279,13 +281,20 @@ _NEEDED = {
 
 
 def derive(
-    readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: bool, tolerance: float
+    parsed_values: Mapping[str, ParsedValue],
+    specs: Mapping[str, QuantitySpec],
+    strict: bool,
+    tolerance: float,
 ) -> MotorParameters:
     """Return the parameters that follow from printed values; see `from_datasheet`."""
     if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not tolerance > 0.0:
         raise ValueError(f"tolerance = {tolerance!r}: must be a number > 0, such as 0.2")
-    lossy = ("torque_constant",) if strict and _has_loss(readings, kinds, tolerance) else ()
-    derivation = _Derivation(readings, kinds, lossy)
+    lossy_quantities = (
+        ("torque_constant",)
+        if strict and _includes_gear_loss(parsed_values, specs, tolerance)
+        else ()
+    )
+    derivation = _Derivation(parsed_values, specs, lossy_quantities)
     values, origins, printed = (
         derivation.values,
         derivation.origins,
@@ -304,9 +313,9 @@ def derive(
                 f"datasheet.{name} = {values[name]:.4g}: must be > 0, but {origins[name]}; check"
                 " these values"
             )
-    derivation.settle_gear(strict, tolerance)
+    derivation.complete_gear(strict, tolerance)
     if "no_load_current" in printed:
-        derivation.settle_friction()
+        derivation.derive_friction()
     disagreements = derivation.disagreements(printed)
     if strict and disagreements and not abs(disagreements[0].difference) <= tolerance:
         worst = disagreements[0]
@@ -341,61 +350,70 @@ def derive(
     )
 
 
-def _has_loss(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], tolerance: float) -> bool:
-    """Return True if a torque constant at the output must include the gear's losses.
+def _includes_gear_loss(
+    parsed_values: Mapping[str, ParsedValue], specs: Mapping[str, QuantitySpec], tolerance: float
+) -> bool:
+    """Return True if a torque constant printed at the output must include the gear's losses.
 
-    This is the case if no efficiency is printed, and the constant without losses would be smaller
-    than the back-EMF constant that follows from the rest, by more than the tolerance.
+    This is the case if no efficiency is printed, and the constant, divided by the gear ratio alone,
+    is smaller by more than the tolerance than the back-EMF constant from the other values.
     """
-    reading, ratio = readings.get("torque_constant"), readings.get("gear_ratio")
+    reading, ratio = parsed_values.get("torque_constant"), parsed_values.get("gear_ratio")
     if (
         reading is None
         or ratio is None
         or reading.shaft != "output"
-        or "gear_efficiency" in readings
+        or "gear_efficiency" in parsed_values
     ):
         return False
-    derivation_without = _Derivation(
-        {name: value for name, value in readings.items() if name != "torque_constant"}, kinds
+    other_values = _Derivation(
+        {name: value for name, value in parsed_values.items() if name != "torque_constant"}, specs
     )
-    derivation_without.values.setdefault("no_load_current", 0.0)
-    derivation_without.apply_rules()
-    constant = derivation_without.values.get("back_emf_constant", 0.0)
+    other_values.values.setdefault("no_load_current", 0.0)
+    other_values.apply_rules()
+    constant = other_values.values.get("back_emf_constant", 0.0)
     return bool(reading.value / ratio.value < constant / (1.0 + tolerance))
 
 
 class _Derivation:
-    """Known quantities of a motor at its shaft, each with a sentence on its origin."""
+    """Known quantities of a motor, each with a sentence on its origin."""
 
     def __init__(
-        self, readings: Mapping[str, Reading], kinds: Mapping[str, Kind], lossy: Sequence[str] = ()
+        self,
+        parsed_values: Mapping[str, ParsedValue],
+        specs: Mapping[str, QuantitySpec],
+        lossy_quantities: Sequence[str] = (),
     ) -> None:
-        """Start with the printed values.
+        """Start with the printed values, referred to the motor's shaft.
 
-        Torques at the output, and quantities in `lossy`, remain at the output under other names.
+        Torques at the output, and `lossy_quantities`, depend on the efficiency of the gear: they
+        are stored as they are, under names that end in `_at_output`.
         """
         self.values: dict[str, Any] = {}
         self.origins: dict[str, str] = {}
-        self._units = {name: kind.unit for name, kind in kinds.items()}
+        self._units = {name: spec.unit for name, spec in specs.items()}
         self._units |= {name: self._units[name.removesuffix("_at_output")] for name in AT_OUTPUT}
-        for name, (value, printed, shaft) in readings.items():
-            power, quantity, place_text = kinds[name].power, name, ""
-            if shaft != "motor" and power != 0:
-                if "gear_ratio" not in readings:
+        for name, (value, printed, shaft) in parsed_values.items():
+            gear_exponent, quantity, shaft_text = specs[name].gear_exponent, name, ""
+            if shaft != "motor" and gear_exponent != 0:
+                if "gear_ratio" not in parsed_values:
                     raise ValueError(
                         f"datasheet.{name} = {printed!r} at the output: needs the gear ratio; write"
                         " gear_ratio = 30, or gear_ratio = 1 to describe the motor as it is seen"
                         " at the output"
                     )
-                place_text = " at the output"
-                if name.endswith("torque") or name in lossy:
+                shaft_text = " at the output"
+                if name.endswith("torque") or name in lossy_quantities:
                     quantity = f"{name}_at_output"
                 else:
-                    ratio = readings["gear_ratio"].value
-                    value, place_text = value * ratio**power, f"{place_text} * {ratio:g}^{power}"
+                    ratio = parsed_values["gear_ratio"].value
+                    value, shaft_text = (
+                        value * ratio**gear_exponent,
+                        f"{shaft_text} * {ratio:g}^{gear_exponent}",
+                    )
             self.values[quantity], self.origins[quantity] = (
                 value,
-                f"{name} = {printed}{place_text}, printed",
+                f"{name} = {printed}{shaft_text}, printed",
             )
 
     def _can_evaluate(self, formula: str) -> bool:
@@ -403,18 +421,18 @@ class _Derivation:
         return self.values.keys() >= {*compile_formula(formula).co_names}
 
     def _substituted(self, formula: str) -> str:
-        """Return a formula with numbers and their units in place of names."""
+        """Return a formula with values and units in place of the names."""
         return re.sub(
             NAME,
             lambda match: f"{self.values[match[0]]:.4g} {self._units[match[0]]}".strip(),
             formula,
         )
 
-    def _add(self, name: str, formula: str, value: Any, more: str = "") -> None:
-        """Add a quantity, with its formula as its origin."""
+    def _add(self, name: str, formula: str, value: Any, remark: str = "") -> None:
+        """Add a quantity, with its formula and a remark as its origin."""
         self.values[name] = value
         self.origins[name] = (
-            f"{name} = {formula} = {self._substituted(formula)} = {self._substituted(name)}{more}"
+            f"{name} = {formula} = {self._substituted(formula)} = {self._substituted(name)}{remark}"
         )
 
     def quantities_in(self, formula: str) -> list[str]:
@@ -422,7 +440,7 @@ class _Derivation:
         return [name for name in dict.fromkeys(re.findall(NAME, formula)) if name in self._units]
 
     def printed_sources(self, names: list[str]) -> list[str]:
-        """Return the printed quantities from which some quantities follow."""
+        """Return the printed quantities from which the named ones were derived."""
         sources: list[str] = []
         while names:
             name = names.pop(0)
@@ -437,7 +455,7 @@ class _Derivation:
         return list(dict.fromkeys(sources))
 
     def apply_rules(self) -> None:
-        """Apply the first rule that adds a quantity, until there is none."""
+        """Apply rules until none adds a quantity; the first applicable one is always next."""
         # The rules are text, so that messages can quote them; they are constants of this module.
         values = self.values
         while new := next(
@@ -452,7 +470,7 @@ class _Derivation:
                     " divides by 0; check these values"
                 ) from error
 
-    def settle_gear(self, strict: bool, tolerance: float) -> None:
+    def complete_gear(self, strict: bool, tolerance: float) -> None:
         """Set ratio and efficiency of a missing gear to 1; check a derived efficiency."""
         values, origins = self.values, self.origins
         for name in ("gear_ratio", "gear_efficiency"):
@@ -471,7 +489,7 @@ class _Derivation:
             values["gear_efficiency"] = 1.0
             origins["gear_efficiency"] += ", taken as 1"
 
-    def settle_friction(self) -> None:
+    def derive_friction(self) -> None:
         """Derive friction from the no-load current; by default it is Coulomb friction."""
         values = self.values
         coulomb, viscous = "coulomb_friction" in values, "viscous_friction" in values
@@ -489,23 +507,26 @@ class _Derivation:
                 "viscous_friction = 0: the no-load current is taken as Coulomb friction alone"
             )
         elif coulomb != viscous and "no_load_speed" in values:
-            speed, more = values["no_load_speed"], ", not below 0"
+            speed, remark = values["no_load_speed"], ", not below 0"
             if coulomb:
                 value = max(0.0, (total - values["coulomb_friction"]) / speed)
                 self._add(
                     "viscous_friction",
                     f"({formula} - coulomb_friction) / no_load_speed",
                     value,
-                    more,
+                    remark,
                 )
             else:
                 value = max(0.0, total - values["viscous_friction"] * speed)
                 self._add(
-                    "coulomb_friction", f"{formula} - viscous_friction * no_load_speed", value, more
+                    "coulomb_friction",
+                    f"{formula} - viscous_friction * no_load_speed",
+                    value,
+                    remark,
                 )
 
     def disagreements(self, printed: set[str]) -> tuple[Disagreement, ...]:
-        """Return printed values that differ from computed ones, the largest first."""
+        """Return the differences between printed and computed values, the largest first."""
         disagreements = []
         for quantity, formula, explanation in CHECKS:
             if quantity in printed and self._can_evaluate(formula):

@@ -39,7 +39,7 @@ _SPELLINGS = (
     (r"(?<=[A-Za-z])-(?=[A-Za-z])", "*"),  # lb-ft, N-m
 )
 
-_USUAL = {
+_COMMON_UNITS = {
     "": {"": 1.0},
     "A": {"A": 1.0, "mA": 1e-3},
     "H": {"H": 1.0, "mH": 1e-3, "uH": 1e-6},
@@ -61,51 +61,51 @@ _USUAL = {
     "rad/s/V": {"rpm/V": 0.10471975511965977},
     "s": {"s": 1.0, "ms": 1e-3},
 }
-"""Common units for each SI unit, with their sizes according to pint. Pint itself takes longer to
-load than everything else.
+"""SI unit -> common units with their sizes in it, as pint defines them. With this table most
+datasheets are read without importing pint, which takes half a second.
 """
 
 
-class Kind(NamedTuple):
-    """Quantity that a field may hold."""
+class QuantitySpec(NamedTuple):
+    """Unit and bounds of the quantity that a datasheet field holds."""
 
     unit: str
     """SI unit."""
     example: str
     """Example of a printed value, for messages."""
-    power: int = 0
+    gear_exponent: int = 0
     """Exponent: a value v at the output of a gear N is v*N**power at the motor's shaft."""
-    zero: bool = False
+    allow_zero: bool = False
     """True if zero is allowed."""
 
 
-class Reading(NamedTuple):
+class ParsedValue(NamedTuple):
     """Parsed value of a datasheet."""
 
     value: float
-    """Value in the SI unit of its kind."""
+    """Value in the SI unit of its quantity."""
     printed: str
     """Printed text without the shaft."""
     shaft: str | None
     """`motor`, `output`, or None if not stated."""
 
 
-def parse_value(name: str, printed: Any, kind: Kind) -> Reading:
+def parse_value(name: str, printed: Any, spec: QuantitySpec) -> ParsedValue:
     """Parse a printed value, such as `25.1 mN*m/A`, `2 * 0.3 ohm` or `2.42 N*m at output`.
 
-    A quantity without a unit may also be a number.
+    The value of a quantity without a unit, such as a gear ratio, may also be a number.
 
     Raises:
         ValueError: the value has no unit, a wrong or unknown one, more than one number, or is not
             positive.
     """
-    if not kind.unit and isinstance(printed, int | float) and not isinstance(printed, bool):
+    if not spec.unit and isinstance(printed, int | float) and not isinstance(printed, bool):
         printed = str(printed)
     # A gear ratio may be printed as 30:1.
-    if not kind.unit and isinstance(printed, str):
+    if not spec.unit and isinstance(printed, str):
         printed = re.sub(r"\s*:\s*1\s*$", "", printed)
     if (
-        kind.unit == "rad/s"
+        spec.unit == "rad/s"
         and isinstance(printed, str)
         # The speed of a servo is printed as the time for an angle.
         and (transit := _TRANSIT.fullmatch(printed))
@@ -115,9 +115,9 @@ def parse_value(name: str, printed: Any, kind: Kind) -> Reading:
         )
         time, angle = float(time) * (1e-3 if milli else 1.0), math.radians(float(angle))
         if time > 0.0 and angle > 0.0:
-            return Reading(angle / time, printed.strip(), transit[7])
+            return ParsedValue(angle / time, printed.strip(), transit[7])
     match = _PRINTED.fullmatch(printed) if isinstance(printed, str) else None
-    remedy = f'write a number and its unit, such as {name} = "{kind.example}"'
+    remedy = f'write a number and its unit, such as {name} = "{spec.example}"'
     if match is None:
         raise ValueError(
             f"datasheet.{name} = {printed!r}: must be a number with its unit, as text; {remedy}"
@@ -133,40 +133,44 @@ def parse_value(name: str, printed: Any, kind: Kind) -> Reading:
             f"datasheet.{name} = {printed!r}: is an electrical speed; divide it by the"
             " number of pole pairs, and write rpm"
         )
-    if not unit and kind.unit:
+    if not unit and spec.unit:
         raise ValueError(f"datasheet.{name} = {printed!r}: has no unit; {remedy}")
     try:
         value = float(
-            to_si(math.prod(map(float, factors.split("*"))), unit, kind.unit, weights=True)
+            to_si(math.prod(map(float, factors.split("*"))), unit, spec.unit, mass_as_weight=True)
         )
     except ValueError as error:
         raise ValueError(f"datasheet.{name} = {printed!r}: {error}; {remedy}") from error
-    bound = "a finite number >= 0" if kind.zero else "a finite number > 0"
-    if not (math.isfinite(value) and (value > 0.0 or (value == 0.0 and kind.zero))):
+    bound = "a finite number >= 0" if spec.allow_zero else "a finite number > 0"
+    if not (math.isfinite(value) and (value > 0.0 or (value == 0.0 and spec.allow_zero))):
         raise ValueError(
             f"datasheet.{name} = {printed!r}: must be {bound}; give its magnitude, or leave the"
             " field out"
         )
-    return Reading(value, f"{factors} {unit}".strip(), shaft)
+    return ParsedValue(value, f"{factors} {unit}".strip(), shaft)
 
 
 def to_si(
-    number: Any, unit: str, kind: str | None, of: str = "this quantity", weights: bool = False
+    number: Any,
+    unit: str,
+    si_unit: str | None,
+    quantity_name: str = "this quantity",
+    mass_as_weight: bool = False,
 ) -> Any:
-    """Convert a number to the SI unit of its kind, or to SI base units for kind None.
+    """Convert a number to the SI unit of its quantity, or to SI base units for `si_unit` None.
 
     Args:
         number: the number, or an array.
-        unit: its unit, spelled as in datasheets and logs.
-        kind: SI unit of the quantity; None for any quantity.
-        of: name of the quantity, for messages.
-        weights: read a mass as its weight if the dimension requires a force, as in kg*cm and oz*in.
+        unit: unit of the number, spelled as in datasheets and logs.
+        si_unit: SI unit of the quantity; None for any quantity.
+        quantity_name: name of the quantity, for messages.
+        mass_as_weight: True to read a mass as a weight where a force is required, as in kg*cm.
 
     Raises:
         ValueError: the unit is unknown or does not fit; the caller adds the remedy.
     """
-    if kind is not None and unit in (usual := _USUAL.get(kind, {})):
-        return number * usual[unit]
+    if si_unit is not None and unit in (sizes := _COMMON_UNITS.get(si_unit, {})):
+        return number * sizes[unit]
     registry = unit_registry()
     for spelling, plain in _SPELLINGS:
         unit = re.sub(spelling, plain, unit)
@@ -175,24 +179,26 @@ def to_si(
         quantity = registry.Quantity(number, unit)
     except Exception as error:
         raise ValueError(f"the unit {unit!r} is not known") from error
-    if kind is None:
+    if si_unit is None:
         return quantity.to_base_units().magnitude
-    dimensionality = registry.Quantity(1.0, kind).dimensionality
+    dimensionality = registry.Quantity(1.0, si_unit).dimensionality
     # A torque in kg*cm lacks one standard gravity to be a force times a length.
     if (
-        weights
+        mass_as_weight
         and quantity.dimensionality == dimensionality / registry.standard_gravity.dimensionality
     ):
         quantity = quantity * registry.standard_gravity
     if quantity.dimensionality != dimensionality:
-        raise ValueError(f"{unit!r} is not a unit of {of}, which is in {kind or 'no unit'}")
+        raise ValueError(
+            f"{unit!r} is not a unit of {quantity_name}, which is in {si_unit or 'no unit'}"
+        )
     # Pint treats angles as plain numbers, so it would convert Hz and 1/s without a factor of 2*pi.
     units = {name for name, _ in quantity.unit_items()}
     if any(name.endswith("hertz") for name in units) or (
-        kind.startswith("rad") and not any(name.endswith(tuple(_ANGLES)) for name in units)
+        si_unit.startswith("rad") and not any(name.endswith(tuple(_ANGLES)) for name in units)
     ):
         raise ValueError("Hz and 1/s are ambiguous: turns or radians?")
-    return quantity.to(kind or "dimensionless").magnitude
+    return quantity.to(si_unit or "dimensionless").magnitude
 
 
 @functools.cache

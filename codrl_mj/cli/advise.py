@@ -137,7 +137,7 @@ def _print_advice(name: str, advice: Any) -> None:
 
     columns = "effect on the largest force", "value", "unit"
     rows: list[tuple[Any, ...]] = [
-        (label, format(getattr(advice.delivery, field), digits), unit)
+        (label, format(getattr(advice.response, field), digits), unit)
         for field, (label, unit, digits) in _DELIVERED.items()
     ]
     print_table(f"{name} on {advice.task}, on the bench", columns, rows, right=("value",))
@@ -180,7 +180,7 @@ def _print_options(title: str, options: Any) -> None:
                 (
                     name,
                     *(
-                        _loss_cells(outcome, options[name].bound)
+                        _loss_cells(outcome, options[name].prefix)
                         if outcome
                         else ("not tested", "", "", "")
                     ),

@@ -23,7 +23,7 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.sources import find_source, is_source_name
-from codrl_mj.fields import field_docs, parts
+from codrl_mj.fields import field_docs, nested_types
 from codrl_mj.runs import CONFIG
 from codrl_mj.user_code import allow_imports_from_files, read_yaml
 
@@ -45,7 +45,7 @@ def flag_dataclass(
         exclude: names of fields without a flag.
         extra_fields: further fields, as for `dataclasses.make_dataclass`.
     """
-    docs, hints, nested = field_docs(kind), typing.get_type_hints(kind), parts(kind)
+    docs, hints, nested = field_docs(kind), typing.get_type_hints(kind), nested_types(kind)
     fields: list[Any] = []
     for name in (field.name for field in dataclasses.fields(kind) if field.name not in exclude):
         annotation, value = hints[name], getattr(defaults, name, None)

@@ -377,10 +377,10 @@ class PlanExperiment:
             f"* play {best.kind}, {best.amplitude:.4g} V, {best.duration:g} s{clock}, rows at"
             f" {experiments.best.rate:g} Hz"
         )
-        if experiments.missed:
+        if experiments.missed_goals:
             print_text(
-                f"it misses the goals of {', '.join(experiments.missed)}: use a larger current, a"
-                " longer log, or other sensors"
+                f"it misses the goals of {', '.join(experiments.missed_goals)}: use a larger"
+                " current, a longer log, or other sensors"
             )
         if experiments.unknown:
             print_text(

@@ -78,7 +78,7 @@ _LIST_COLUMNS = {
 
 @dataclasses.dataclass(frozen=True)
 class List:
-    """List the motors of the catalogue with their torque, speed and power at nominal voltage.
+    """List the motors of the catalogue with their limits at nominal voltage.
 
     Power is the maximum mechanical power. Continuous torque, stall torque and no-load speed are
     those of the gear's output, with friction subtracted; kT and J are those of the motor without
@@ -93,10 +93,10 @@ class List:
 
     def run(self) -> tuple[int, Any]:
         """Print the table."""
-        from codrl_mj.catalogue.datasheet import KINDS
+        from codrl_mj.catalogue.datasheet import QUANTITY_SPECS
         from codrl_mj.catalogue.derivation import PRINTED_NAMES
         from codrl_mj.sizing import catalogue_rows
-        from codrl_mj.sizing.abilities import ABILITY_UNITS
+        from codrl_mj.sizing.limits import LIMIT_UNITS
 
         rows = catalogue_rows(self.sort)
         columns = [f"{head}\n{unit}" for head, unit, _ in _LIST_COLUMNS.values()]
@@ -120,10 +120,8 @@ class List:
             "at: nominal voltage, or 24 V if the datasheet has none. –: not on the datasheet."
         )
         print("codrl-mj motor show NAME gives the source of each number")
-        kinds = {name: KINDS.get(PRINTED_NAMES.get(name, name)) for name in rows[0]}
-        units = ABILITY_UNITS | {
-            name: kind.unit for name, kind in kinds.items() if kind is not None
-        }
+        specs = {name: QUANTITY_SPECS.get(PRINTED_NAMES.get(name, name)) for name in rows[0]}
+        units = LIMIT_UNITS | {name: spec.unit for name, spec in specs.items() if spec is not None}
         return 0, {"units": units, "motors": rows}
 
 
@@ -149,10 +147,10 @@ class Show:
 
     def run(self) -> tuple[int, Any]:
         """Print the tables and draw the diagram."""
-        from codrl_mj.sizing import explain, find_entry, find_loop
+        from codrl_mj.sizing import describe_motor, find_entry, find_loop
 
         drive, entry = self.changes.drive(self.name), find_entry(self.name)
-        explanation = explain(drive, entry, find_loop(self.name))
+        explanation = describe_motor(drive, entry, find_loop(self.name))
         if self.out is not None:
             from codrl_mj.viz.pages.diagrams import torque_speed_diagram
 
@@ -171,7 +169,7 @@ class Show:
 
 
 def _print_explanation(title: str, volts: float, explanation: dict[str, Any]) -> None:
-    """Print the abilities of a motor, then its numbers, then the notes on them."""
+    """Print the limits of a motor, then its parameters, then the notes on them."""
     from codrl_mj.sizing import describe_unknown
 
     def show(title: str, part: str) -> None:
@@ -181,7 +179,7 @@ def _print_explanation(title: str, volts: float, explanation: dict[str, Any]) ->
         print_table(title, ("number", "value", "unit"), rows, right=("value",))
 
     print_text(title)
-    show(f"Abilities at its output, at {volts:g} V", "abilities")
+    show(f"Limits at the output, at {volts:g} V", "abilities")
     print_text(explanation["assumed"])
     if "numbers" in explanation:
         rows = []
@@ -267,10 +265,15 @@ class Design:
 
     def run(self) -> tuple[int, Any]:
         """Print the table and draw the Bode plot."""
-        from codrl_mj.sizing import LoopDesign, design, designs, undersampling_warning
+        from codrl_mj.sizing import (
+            LoopAnalysis,
+            analyze_loop,
+            analyze_sample_rates,
+            undersampling_warning,
+        )
 
         drive = self.changes.drive(self.name)
-        chosen, all_designs = design(drive), designs(drive)
+        chosen, all_designs = analyze_loop(drive), analyze_sample_rates(drive)
         delay_text = "a sample of delay" if chosen.delayed else "no delay"
         print_text(
             f"{self.name} at {chosen.sample_rate:g} Hz, {delay_text}: kp = {chosen.kp:.6g} V/A,"
@@ -280,7 +283,7 @@ class Design:
         for (rate, delayed), candidate in all_designs.items():
             mark = "*" if (rate, delayed) == (chosen.sample_rate, chosen.delayed) else ""
             row = [f"{mark}{rate / 1e3:g}", "1" if delayed else "0"]
-            if isinstance(candidate, LoopDesign):
+            if isinstance(candidate, LoopAnalysis):
                 margin = 20.0 * math.log10(candidate.gain_margin)
                 rest = (
                     candidate.kp,
@@ -315,7 +318,7 @@ class Design:
 
             save_plot(bode_diagram(drive), self.out / "bode.png")
         others = [
-            candidate for candidate in all_designs.values() if isinstance(candidate, LoopDesign)
+            candidate for candidate in all_designs.values() if isinstance(candidate, LoopAnalysis)
         ]
         return 0, {"units": _LOOP_UNITS, **vars(chosen), "others": others}
 

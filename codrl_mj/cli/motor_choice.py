@@ -107,15 +107,18 @@ class Feasible:
             rows,
             right=("needs", "has"),
         )
-        operation, best_drive = judgment.operation, with_best_gear(drive, demand, continuous)
+        required, best_drive = (
+            judgment.operating_points,
+            with_best_gear(drive, demand, continuous),
+        )
         best_judgment, (low, high) = (
             feasibility(best_drive, demand, continuous),
             sizing.equivalent_gears(best_drive, demand, continuous),
         )
         print_text(
-            f"{operation.energy_drawn:.3g} J drawn and {operation.copper_loss:.3g} J of heat per"
-            f" episode, {operation.rms_current:.3g} A rms; share of rotor and friction in the"
-            f" largest load: {_own_share_text(drive, operation)}",
+            f"{required.energy_drawn:.3g} J drawn and {required.copper_loss:.3g} J of heat per"
+            f" episode, {required.rms_current:.3g} A rms; share of rotor and friction in the"
+            f" largest load: {_own_share_text(drive, required)}",
             *map(str, judgment.failed_bounds),
             f"best {_gear_text(best_drive, demand)}: {best_judgment.verdict}, with a margin of"
             f" {best_judgment.margin:.0%}; the verdict is the same from {low:.3g} to {high:.3g}",
@@ -134,7 +137,7 @@ class Feasible:
             "verdict": judgment.verdict,
             "margin": judgment.margin,
             "bounds": judgment.bounds,
-            **_operation_mapping(operation),
+            **_operation_mapping(required),
             "best": {
                 "gear_ratio": 1.0 / best_drive.arm_radius,
                 "verdict": best_judgment.verdict,
@@ -271,7 +274,7 @@ class Choose:
                 "does_it": not choice.rejection_reason,
                 "lacks": choice.rejection_reason,
                 "margin": choice.feasibility.margin,
-                **_operation_mapping(choice.feasibility.operation),
+                **_operation_mapping(choice.feasibility.operating_points),
                 "unknown": choice.unknown,
             }
             for name, choice in choices
@@ -293,13 +296,13 @@ _UNITS = {
 }
 
 
-def _operation_mapping(operation: Any) -> dict[str, Any]:
+def _operation_mapping(required: Any) -> dict[str, Any]:
     """Return the numbers of an episode's operation, with names as in `_UNITS`."""
     fields = {
-        name: getattr(operation, name)
+        name: getattr(required, name)
         for name in ("own_share", "rms_current", "energy_drawn", "copper_loss")
     }
-    return {"peak_current": float(abs(operation.current).max()), **fields}
+    return {"peak_current": float(abs(required.current).max()), **fields}
 
 
 def _unknown_text(unknown: Sequence[str], judgment_text: str) -> str:
@@ -335,9 +338,9 @@ def _gear_text(drive: Any, demand: Any) -> str:
     return f"gear {1.0 / drive.arm_radius:.4g}{' rad/m' if demand.linear else ''}"
 
 
-def _own_share_text(drive: Any, operation: Any) -> str:
+def _own_share_text(drive: Any, required: Any) -> str:
     """Return the share of the load that rotor and friction take, if the inertia is known."""
-    return f"{operation.own_share:.0%}" if drive.motor.rotor_inertia > 0.0 else "unknown"
+    return f"{required.own_share:.0%}" if drive.motor.rotor_inertia > 0.0 else "unknown"
 
 
 def _print_ranking(
@@ -359,12 +362,12 @@ def _print_ranking(
     right, rows = [name for name in columns if name not in ("motor", "verdict")], []
     has_motor_names = len(demands) > 1
     for name, choice in choices:
-        operation = choice.feasibility.operation
+        required = choice.feasibility.operating_points
         numbers = (
-            abs(operation.current).max(),
-            operation.rms_current,
-            operation.energy_drawn,
-            operation.copper_loss,
+            abs(required.current).max(),
+            required.rms_current,
+            required.energy_drawn,
+            required.copper_loss,
         )
         gear, verdict = (
             _gear_text(choice.drive, demands[name]),
@@ -380,7 +383,7 @@ def _print_ranking(
             ),
             *(
                 f"{choice.feasibility.margin:.0%}",
-                _own_share_text(choice.drive, operation),
+                _own_share_text(choice.drive, required),
                 *(f"{value:.3g}" for value in numbers),
             ),
         )
@@ -402,7 +405,7 @@ def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
     """
     import numpy as np
 
-    from codrl_mj.sizing.abilities import find_entry
+    from codrl_mj.sizing.limits import find_entry
     from codrl_mj.viz.pages.diagrams import torque_speed_diagram
 
     radius, entry = drive.motor.arm_radius, find_entry(name)

@@ -30,7 +30,7 @@ from codrl_mj.envs.sources import find_source
 from codrl_mj.fields import command
 from codrl_mj.runs import PROGRESS, RESULT, finished
 from codrl_mj.runs.files import read_json
-from codrl_mj.runs.summaries import read_reports
+from codrl_mj.runs.summaries import read_progress
 from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
 from codrl_mj.training.folder import load_config, needs_trust, prepare_run
@@ -262,7 +262,7 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
 
         def show() -> None:
             for row, (file, unit, total) in rows.items():
-                for last in read_reports(file, [])[-1:]:
+                for last in read_progress(file, [])[-1:]:
                     report: dict[str, Any] = {name: float(value) for name, value in last.items()}
                     bar.update(row, completed=min(int(report[unit]), total), **report)
 

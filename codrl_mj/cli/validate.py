@@ -66,20 +66,20 @@ class Validate:
                 certificate = validate_model(model, str(self.model), quick=self.quick, on_part=show)
             else:
                 certificate = validate(tasks, quick=self.quick, on_part=show)
-            caught = try_mutations(tasks, on_part=show) if self.mutations else []
+            results = try_mutations(tasks, on_part=show) if self.mutations else []
         print_certificate(certificate)
-        never_failed = undetected_checks(certificate.checks, caught) if caught else []
-        if caught:
-            print_mutations(caught, never_failed)
+        never_failed = undetected_checks(certificate.checks, results) if results else []
+        if results:
+            print_mutations(results, never_failed)
         if self.out is not None:
             from codrl_mj.viz.pages.certificate import write
 
-            for file in write(certificate, self.out, caught):
+            for file in write(certificate, self.out, results):
                 print(f"wrote {file}")
         failed = (
-            not certificate.passed or never_failed or not all(outcome.failed for outcome in caught)
+            not certificate.passed or never_failed or not all(outcome.failed for outcome in results)
         )
-        return int(bool(failed)), certificate.as_mapping() | as_mapping(certificate, caught)
+        return int(bool(failed)), certificate.as_mapping() | as_mapping(certificate, results)
 
 
 _FRAMED: dict[str, Any] = {"box": box.HEAVY_HEAD, "pad_edge": True, "padding": (0, 1)}
@@ -123,11 +123,11 @@ def print_certificate(certificate: Certificate) -> None:
     )
 
 
-def print_mutations(caught: Sequence[MutationResult], never_failed: Sequence[Check]) -> None:
+def print_mutations(results: Sequence[MutationResult], never_failed: Sequence[Check]) -> None:
     """Print one table with a row for each injected fault, and the checks that no fault fails."""
     columns = "fault", "in", "failed", "clearest check", "worst", "allowed", "beyond"
     rows: list[Any] = []
-    for outcome in caught:
+    for outcome in results:
         check = outcome.clearest_failure
         shown: list[Any] = [Text("MISSED", "red"), "", "", ""]
         if check is not None:

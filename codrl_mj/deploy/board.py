@@ -359,7 +359,7 @@ class BoardTest:
     unanswered: int
     """Number of frames without an answer."""
     rate: float
-    """Exchanged frames and samples per second, including the time of the simulation."""
+    """Exchanged frames plus samples per second [1/s]; the time includes that of the simulation."""
     instructions: tuple[int, int] | None
     """Largest instruction counts of a policy step and a current step; None if not counted."""
 

@@ -35,11 +35,11 @@ class Layer:
 
 
 class Normalization(NamedTuple):
-    """Statistics of `VecNormalize`: (x - mean)/deviation, clipped to +-`clip`, in double."""
+    """Statistics of `VecNormalize`: (x - mean)/std, clipped to +-`clip`, in double."""
 
     mean: np.ndarray
     """Mean, shape (k,), float64."""
-    deviation: np.ndarray
+    std: np.ndarray
     """Standard deviation, including the epsilon, shape (k,), float64."""
     clip: float
     """Largest normalized value."""
@@ -79,9 +79,7 @@ class Network:
         values = "observation"
         if (norm := self.normalization) is not None:
             # ONNX's type 11 is double, type 1 is float.
-            values = node(
-                "Div", node("Sub", node("Cast", values, to=11), norm.mean), norm.deviation
-            )
+            values = node("Div", node("Sub", node("Cast", values, to=11), norm.mean), norm.std)
             values = node("Min", node("Max", values, np.full(1, -norm.clip)), np.full(1, norm.clip))
             values = node("Cast", values, to=1)
         values = node("Mul", values, self.factors)
@@ -103,7 +101,7 @@ class Network:
         """Return actions (N, m) or indices (N,) for observations (N, k), computed in `dtype`."""
         values = observations
         if (norm := self.normalization) is not None:
-            values = np.clip((values - norm.mean) / norm.deviation, -norm.clip, norm.clip)
+            values = np.clip((values - norm.mean) / norm.std, -norm.clip, norm.clip)
         values = values.astype(dtype) * self.factors.astype(dtype)
         for layer in self.layers:
             values = ACTIVATIONS[layer.activation](
@@ -146,13 +144,13 @@ class Network:
         factor, norm = float(self.factors[index]), self.normalization
         if norm is None:
             return {"scale": factor, "offset": 0.0}
-        mean, deviation = float(norm.mean[index]), float(norm.deviation[index])
+        mean, std = float(norm.mean[index]), float(norm.std[index])
         statistics = {
             "mean": mean,
-            "variance": deviation**2,
+            "variance": std**2,
             "clip": norm.clip if np.isfinite(norm.clip) else None,
         }
-        return {"scale": factor / deviation, "offset": -factor * mean / deviation, **statistics}
+        return {"scale": factor / std, "offset": -factor * mean / std, **statistics}
 
 
 def extract_network(policy: Policy) -> Network | Tiles:
@@ -170,9 +168,9 @@ def extract_network(policy: Policy) -> Network | Tiles:
         network, rms = extract_network(policy.policy), policy.statistics
         if not rms.norm_obs or isinstance(network, Tiles):
             return network
-        deviation = np.sqrt(rms.obs_rms.var + rms.epsilon)
+        std = np.sqrt(rms.obs_rms.var + rms.epsilon)
         return dataclasses.replace(
-            network, normalization=Normalization(rms.obs_rms.mean, deviation, float(rms.clip_obs))
+            network, normalization=Normalization(rms.obs_rms.mean, std, float(rms.clip_obs))
         )
 
     # The imports are local because SARSA's policy does not need Stable-Baselines3.

@@ -154,7 +154,10 @@ def electrical_step(
     sensor_error: float,
     limit: float,
 ) -> tuple[float, float, float, float]:
-    """Replace `codrl_mj.actuators.electrical_step`: the board computes the voltage."""
+    """Take an electrical step of which the board computes the voltage.
+
+    It replaces `codrl_mj.actuators.electrical_step`, with the same arguments and results.
+    """
     reference = desired_torque / parameters.torque_constant
     voltage, integral, error = sample_on_board(
         reference, current + sensor_error, speed, integral, previous_error

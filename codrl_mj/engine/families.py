@@ -45,13 +45,13 @@ It is split in two because XML files keep only six digits of a number.
 class SlotHeader(NamedTuple):
     """Header of an actuator's slot, its state in `data.act` or `data.plugin_state`.
 
-    The header is followed by the family's committed state (at time `tick`), the candidate state one
-    step later, the signals, and a 0. The 0 is there because the engine multiplies the last
+    The header is followed by the family's committed state (at `state_time`), the candidate state
+    one step later, the signals, and a 0. The 0 is there because the engine multiplies the last
     activation by the actuator's gain, which is 0: an infinite signal in its place would give NaN.
     """
 
-    tick: float
-    """Time [s] of the committed state."""
+    state_time: float
+    """Simulation time [s] of the committed state."""
     noise_key: float
     """Key of the episode's random numbers."""
     torque: float

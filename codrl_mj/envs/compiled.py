@@ -37,7 +37,7 @@ from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import f32, f64, i64, internal, stack_floats, to_floats
 from codrl_mj.envs.setup import FIRST_OPTION, NEEDS_KEY, ResolvedEnv
 from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
-from codrl_mj.physics.rows import Lane, Rows, load, store
+from codrl_mj.physics.rows import BatchRows, Lane, load, store
 from codrl_mj.physics.sharing import make_shared_kernel
 from codrl_mj.physics.stepping import OBSERVATION, OPTIONS, Stepping, simulation_at
 
@@ -225,8 +225,8 @@ def _kernels(
 
     @internal
     def step_range(first: int, end: int, lane: Any, rows: Any, steps: Any) -> int:
-        # The batch passes plain tuples. They are converted to named tuples for readability.
-        steps, lane, rows, num_diverged = VectorStep(*steps), Lane(*lane), Rows(*rows), 0
+        # The batch passes plain tuples; they become named tuples again to be readable.
+        steps, lane, rows, num_diverged = VectorStep(*steps), Lane(*lane), BatchRows(*rows), 0
         stepping, observations, signals, elapsed = (
             steps.stepping,
             steps.observations,
@@ -252,7 +252,7 @@ def _kernels(
 
     @jit
     def observe_rows(indices: np.ndarray, lane: Any, rows: Any, observations: np.ndarray) -> None:
-        lane, rows = Lane(*lane), Rows(*rows)
+        lane, rows = Lane(*lane), BatchRows(*rows)
         no_signals, state = np.zeros(lane.trace.shape[1:]), np.empty(size)
         for row in indices:
             load(rows, row, lane)

@@ -189,7 +189,7 @@ class EnvSource(abc.ABC):
         return dict(actuators)
 
     def override_actuators(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
-        """Return pattern -> actuator: `patterns`, and the configuration's for all other motors."""
+        """Return pattern -> actuator: those in `patterns`, else the configured ones."""
         from codrl_mj.engine.reading import actuators_sharing_motor
         from codrl_mj.engine.specs import match_pattern, matchable_names
 

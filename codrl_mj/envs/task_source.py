@@ -182,7 +182,7 @@ class TaskEnvSource(EnvSource):
         )
 
     def override_actuators(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
-        """Return motor -> actuator: those of `patterns`, and the configuration's for the rest."""
+        """Return motor -> actuator: those in `patterns`, else the configured ones."""
         return {**config.actuators_by_name, **self._by_pattern(patterns)}
 
     @property

@@ -28,7 +28,9 @@ class Quartiles(NamedTuple):
 
     median: float
     low: float
+    """25th percentile."""
     high: float
+    """75th percentile."""
 
 
 def bootstrap_mean(values: np.ndarray) -> Interval:

@@ -15,7 +15,7 @@ from codrl_mj.identify.friction import choose_friction, load_hint
 from codrl_mj.identify.log import (
     SEGMENT_DURATION,
     Log,
-    assign_logs,
+    assign_log_roles,
     find_obstacle,
     has_motion,
     shift_signal,
@@ -91,7 +91,7 @@ def identify(
         name: getattr(motor, name) for name in LOSS_PARAMETERS if motor is not None
     }
     rig = rig or ("pendulum" if "mgl" in fixed else "free")
-    electrical, moving, driven_by, output = assign_logs(logs)
+    electrical, moving, driven_by, output = assign_log_roles(logs)
     total = STEPS_PER_PART * max(bool(electrical) + bool(moving), 1) + 4 * len(moving) * (
         friction == "auto"
     )
@@ -305,7 +305,7 @@ def check_arguments(
     # Without the gear ratio of the base, fitted motor parameters would be values at the output.
     ratio = 1.0 if motor is None else motor.gear_ratio
     known = {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **(known or {})}
-    _, moving, driven_by, output = assign_logs(logs)
+    _, moving, driven_by, output = assign_log_roles(logs)
     if not segment >= 0.05:
         raise ValueError(
             f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT_DURATION:g} is the default"
@@ -365,7 +365,7 @@ def predict_missing(
 
     Only the presence of signals and of a motion is considered, so that no fit is needed.
     """
-    electrical, moving, driven_by, _ = assign_logs(logs)
+    electrical, moving, driven_by, _ = assign_log_roles(logs)
     names = {*known, *(("resistance", "inductance") if electrical else ())}
     names |= {"resistance"} if driven_by == "voltage" else set()
     constants = {"torque_constant", "back_emf_constant"}

@@ -217,8 +217,8 @@ class LogRoles(NamedTuple):
     output: str
 
 
-def assign_logs(logs: Sequence[Log]) -> LogRoles:
-    """Assign logs to the winding and to the shaft, and choose the shaft's input and output."""
+def assign_log_roles(logs: Sequence[Log]) -> LogRoles:
+    """Return which logs determine the winding and which the shaft, with the shaft's signals."""
     moving = [log for log in logs if has_motion(log)]
     driven_by, output = (
         next((name for name in names if moving and all(log.has(name) for log in moving)), None)
@@ -234,7 +234,7 @@ def find_obstacle(logs: Sequence[Log]) -> Finding | None:
 
     `check` reports it as a finding, `identify` as an error.
     """
-    electrical, moving, driven_by, _ = assign_logs(logs)
+    electrical, moving, driven_by, _ = assign_log_roles(logs)
     if not electrical and driven_by is None:
         return _no_signals(logs, bool(moving))
     for log in moving:

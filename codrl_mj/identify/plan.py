@@ -95,7 +95,7 @@ class Plan(NamedTuple):
     # Among the options whose errors are below all goals by the factor `MARGIN`, the option with the
     # lowest rate. If there is none, the option with the smallest `worst`.
     best: Option
-    missed: list[str]  # parameters for which the best option misses the goal
+    missed_goals: list[str]  # parameters whose goals the best option misses
     unknown: list[str]  # parameters that are 0 on the datasheet, so that no error can be expected
 
 
@@ -152,8 +152,8 @@ def plan(
         else min(options, key=lambda choice: choice.worst)
     )
     names = [name for name in GOALS if truth[name] > 0.0]
-    missed = [name for name in names if best.errors.get(name, math.inf) > GOALS[name]]
-    return Plan(options, best, missed, [name for name in GOALS if name not in names])
+    missed_goals = [name for name in names if best.errors.get(name, math.inf) > GOALS[name]]
+    return Plan(options, best, missed_goals, [name for name in GOALS if name not in names])
 
 
 def write_excitation(path: Path, option: Option) -> None:

@@ -13,7 +13,7 @@ from codrl_mj.physics.base import MAX_STATE, SimulationConfig, SimulationDiverge
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.physics.mjcf import flags_with_friction
 from codrl_mj.physics.mujoco_single import MujocoPhysics
-from codrl_mj.physics.rows import Rows, derive_fields, make_lane, state_slice
+from codrl_mj.physics.rows import BatchRows, derive_fields, make_lane, state_slice
 from codrl_mj.physics.sharing import new_board, num_cpus, run_shared
 from codrl_mj.physics.stepping import NOISE_KEY
 from codrl_mj.physics.variation import (
@@ -95,7 +95,7 @@ class MujocoBatchPhysics:
         )
         memory = self._disturber.memory
         self._rows = tuple(
-            Rows(self._states, self._arms, memory.reshape(*self._arms.shape, memory.shape[1]))
+            BatchRows(self._states, self._arms, memory.reshape(*self._arms.shape, memory.shape[1]))
         )
 
     def _lane(self) -> tuple[Any, ...]:

@@ -35,8 +35,8 @@ _STATE_PARTS = {
 _MEMORY = PointerTable._fields.index("memory")
 
 
-class Rows(NamedTuple):
-    """Arrays of all simulations, with a row for each."""
+class BatchRows(NamedTuple):
+    """Arrays with a row for each simulation of a batch."""
 
     states: np.ndarray
     """States of the engine, shape (N, k), entries as in mjSTATE_INTEGRATION."""
@@ -105,7 +105,7 @@ def load_fields(row: int, lane: Lane) -> None:
 
 
 @internal
-def load(rows: Rows, row: int, lane: Lane) -> None:
+def load(rows: BatchRows, row: int, lane: Lane) -> None:
     """Load a row into the lane's simulation."""
     load_fields(row, lane)
     lane.pointer_table[_MEMORY] = rows.memory.ctypes.data + row * rows.memory.strides[0]
@@ -119,7 +119,7 @@ def load(rows: Rows, row: int, lane: Lane) -> None:
 
 
 @internal
-def store(rows: Rows, row: int, lane: Lane) -> None:
+def store(rows: BatchRows, row: int, lane: Lane) -> None:
     """Copy the state of the lane's simulation into a row."""
     state = rows.states.ctypes.data + row * rows.states.strides[0]
     for part_index in range(len(lane.parts)):

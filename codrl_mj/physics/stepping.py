@@ -72,10 +72,13 @@ class PointerTable(NamedTuple):
     options: int
     observation: int
     actuators: int
-    """Number of actuators; the next two entries are the lengths of their rows."""
+    """Number of actuators: of rows in the settings and in the memory."""
     settings_columns: int
+    """Number of columns of the settings."""
     memory_columns: int
+    """Number of columns of the memory."""
     inner_steps: int
+    """Integration steps per environment step."""
     columns: int
     """Number of columns of the trace."""
 

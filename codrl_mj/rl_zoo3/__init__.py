@@ -11,8 +11,8 @@ from importlib.resources import files
 from typing import Any
 
 
-def read(algorithm: str) -> dict[str, dict[str, Any]]:
-    """Return an algorithm's settings: environment id -> hyperparameter -> value."""
+def read_hyperparameters(algorithm: str) -> dict[str, dict[str, Any]]:
+    """Return an algorithm's hyperparameters: environment id -> hyperparameter -> value."""
     import yaml
 
     settings: dict[str, dict[str, Any]] = yaml.safe_load(

@@ -1,5 +1,5 @@
 """Settings of DQN from dqn.yml, in the form of a configuration module of rl-zoo3."""
 
-from codrl_mj.rl_zoo3 import read
+from codrl_mj.rl_zoo3 import read_hyperparameters
 
-hyperparams = read("dqn")
+hyperparams = read_hyperparameters("dqn")

@@ -1,5 +1,5 @@
 """Settings of PPO from ppo.yml, in the form of a configuration module of rl-zoo3."""
 
-from codrl_mj.rl_zoo3 import read
+from codrl_mj.rl_zoo3 import read_hyperparameters
 
-hyperparams = read("ppo")
+hyperparams = read_hyperparameters("ppo")

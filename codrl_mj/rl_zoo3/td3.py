@@ -1,5 +1,5 @@
 """Settings of TD3 from td3.yml, in the form of a configuration module of rl-zoo3."""
 
-from codrl_mj.rl_zoo3 import read
+from codrl_mj.rl_zoo3 import read_hyperparameters
 
-hyperparams = read("td3")
+hyperparams = read_hyperparameters("td3")

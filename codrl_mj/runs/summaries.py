@@ -141,7 +141,7 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
         config = {}
     env = config.get("env")
     env = env if isinstance(env, Mapping) else {}
-    progress = next(reversed(read_reports(path / PROGRESS, problems)), None)
+    progress = next(reversed(read_progress(path / PROGRESS, problems)), None)
     result = _mapping(path / RESULT, "result of a run", problems)
     evaluation = _mapping(path / EVALUATION, "policy evaluation", problems)
     missing = [file for file in POLICY_FILES if not (path / file).is_file()]
@@ -215,7 +215,7 @@ def _mapping(path: Path, kind: str, problems: list[str]) -> Mapping[str, Any] | 
     return content
 
 
-def read_reports(path: Path, problems: list[str]) -> list[Mapping[str, str]]:
+def read_progress(path: Path, problems: list[str]) -> list[Mapping[str, str]]:
     """Return the complete rows of a training's progress file, as text.
 
     A last row that is only partly written is skipped. If the table cannot be read, the error is

@@ -10,7 +10,6 @@ import numpy as np
 
 from codrl_mj.actuators import Drive, named_mapping, set_display_name
 from codrl_mj.catalogue import MotorEntry, motor_names
-from codrl_mj.sizing.abilities import find_drive, find_entry, max_power
 from codrl_mj.sizing.demand import Demand
 from codrl_mj.sizing.feasibility import (
     MAX_FRICTION_SHARE,
@@ -22,12 +21,13 @@ from codrl_mj.sizing.feasibility import (
     feasibility,
     friction_share,
     margin,
-    operation,
+    operating_points,
 )
+from codrl_mj.sizing.limits import find_drive, find_entry, max_power
 
 MARGIN = 0.2
 """Required margin of voltage and currents: a rule of thumb for tolerances of motor and supply."""
-_SPREAD = math.log(16.0)
+_LOG_RATIO_RANGE = math.log(16.0)
 """Search range of log(gear ratio) on either side of the best ratio for the largest torque and
 speed of the demand.
 """
@@ -48,7 +48,7 @@ class Candidate(NamedTuple):
     drive: Drive
     """Motor with gear and supply."""
     unknown: tuple[str, ...]
-    """Quantities that its datasheet omits and that are ignored."""
+    """Quantities that its datasheet omits, and that the judgment therefore ignores."""
     feasibility: Feasibility
     """Feasibility of the demand on the motor."""
     rejection_reason: str
@@ -87,9 +87,9 @@ def actuators_of(choices: Mapping[str, tuple[Candidate, Demand]]) -> dict[str, A
 
 
 def ignored_quantities(entry: MotorEntry | None) -> tuple[str, ...]:
-    """Return the quantities that a judgment ignores because the datasheet omits them.
+    """Return the quantities that a datasheet omits, and that a judgment therefore ignores.
 
-    Without a datasheet the continuous current is unknown, so heat is ignored.
+    Without a datasheet only the continuous current counts as unknown.
     """
     if entry is None:
         return ("continuous current",)
@@ -111,17 +111,17 @@ def choose(
     """Rank motors with gears: suitable ones by size, then the others by verdict and shortage.
 
     A motor is suitable if `feasibility` returns `surely` with the required margin. A larger motor
-    than needed is no advantage: it is expensive and heavy, and has to accelerate a larger rotor. A
-    motor with a gear keeps its gear, and on a slide gets a wheel; others get the gear of
-    `with_best_gear`.
+    than needed is no advantage: it is expensive and heavy, and has to accelerate a larger rotor. At
+    a rotary joint a motor with a gear keeps it; all other motors get the gear (on a slide, the
+    wheel) of `with_best_gear`.
 
     Args:
         demand: demand of the joint.
         motors: names of motors; None takes the whole catalogue.
         voltage: voltage of the supply [V]; None takes each motor's nominal voltage.
         min_margin: required margin of voltage, largest and continuous current, in [0, 1).
-        gears: available ratios, turns of the rotor for one turn of the joint, on a slide [rad/m];
-            every motor is judged with each of them.
+        gears: gear ratios to try with every motor: turns of the rotor for one turn of the joint, or
+            [rad/m] on a slide; None selects a gear as described above.
         max_current: largest current of the drive [A]; None keeps the limit of each motor.
 
     Raises:
@@ -176,7 +176,7 @@ def _rejection_reason(judgment: Feasibility, min_margin: float) -> str:
 
 
 def with_best_gear(drive: Drive, demand: Demand, continuous: float | None = None) -> Drive:
-    """Return the drive with the gear (or wheel, on a slide) of the largest margin.
+    """Return the drive with the gear (on a slide, the wheel) that gives the largest margin.
 
     The ratio is >= 1 at a rotary joint. Coulomb friction takes at most `MAX_FRICTION_SHARE` of the
     load, if a positive margin is possible with such a ratio.
@@ -196,12 +196,12 @@ def with_best_gear(drive: Drive, demand: Demand, continuous: float | None = None
     # ratio N. So the utilization has one minimum over N, which a bounded scalar search finds.
     def utilization(logarithm: float) -> float:
         with_gear = _with_ratio(drive, demand, logarithm)
-        required = operation(demand, with_gear)
+        required = operating_points(demand, with_gear)
         rotor_share = 0.0 if demand.exact else required.own_share / MAX_ROTOR_SHARE
         return max(1.0 - margin(with_gear, required, continuous), rotor_share)
 
-    def best_below(highest: float) -> Drive:
-        within = low, max(min(highest, high), low + 1e-9)
+    def best_below(max_log_ratio: float) -> Drive:
+        within = low, max(min(max_log_ratio, high), low + 1e-9)
         optimum = minimize_scalar(
             utilization, bounds=within, method="bounded", options={"xatol": 0.01}
         ).x
@@ -211,7 +211,7 @@ def with_best_gear(drive: Drive, demand: Demand, continuous: float | None = None
     friction = 0.0 if demand.exact else friction_share(_with_ratio(drive, demand, 0.0), demand)
     if friction > 0.0 and MAX_FRICTION_SHARE / friction > math.exp(low):
         limited = best_below(math.log(MAX_FRICTION_SHARE / friction))
-        if margin(limited, operation(demand, limited), continuous) >= 0.0:
+        if margin(limited, operating_points(demand, limited), continuous) >= 0.0:
             return limited
     return best_below(math.inf)
 
@@ -219,7 +219,7 @@ def with_best_gear(drive: Drive, demand: Demand, continuous: float | None = None
 def equivalent_gears(
     best: Drive, demand: Demand, continuous: float | None = None
 ) -> tuple[float, float]:
-    """Return the lowest and highest ratio with the same verdict as the best ratio."""
+    """Return the lowest and highest gear ratio with the same verdict as the drive `best`."""
     verdict, middle = feasibility(best, demand, continuous).verdict, -math.log(best.arm_radius)
 
     def edge(outside: float) -> float:
@@ -248,8 +248,8 @@ def _log_ratio_bounds(drive: Drive, demand: Demand) -> tuple[float, float]:
     if not torque * speed * drive.motor.back_emf_constant > 0.0:
         return -math.log(drive.arm_radius), -math.log(drive.arm_radius)
     middle = math.log(best_ratio(torque, speed, drive.motor))
-    low = middle - _SPREAD if demand.linear else max(middle - _SPREAD, 0.0)
-    return low, max(middle + _SPREAD, low + 1e-9)
+    low = middle - _LOG_RATIO_RANGE if demand.linear else max(middle - _LOG_RATIO_RANGE, 0.0)
+    return low, max(middle + _LOG_RATIO_RANGE, low + 1e-9)
 
 
 def _with_ratio(drive: Drive, demand: Demand, logarithm: float) -> Drive:

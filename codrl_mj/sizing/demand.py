@@ -23,17 +23,17 @@ class Demand:
     """Operating points of one joint over T steps; on a slide in N, m/s and m/s^2.
 
     Where the task stops the joint, at walls and speed limits, `acceleration` includes the stop. The
-    demand is then conservative, because in reality the wall decelerates the rotor, not the motor.
+    demand is then conservative, because in reality the wall, not the motor, stops the rotor.
     """
 
     source: str
-    """Description of the origin."""
+    """Description of the demand's origin, for reports."""
     duration: np.ndarray
     """Duration of each step [s], shape (T,)."""
     torque: np.ndarray
     """Torque at the joint [N*m], shape (T,)."""
     speed: np.ndarray
-    """Speed of the joint [rad/s] at the start of each step, shape (T,), as the drive sees it."""
+    """Speed of the joint [rad/s] at the start of each step, which an actuator uses, shape (T,)."""
     acceleration: np.ndarray
     """Acceleration of the joint [rad/s^2], from differences of the speed, shape (T,)."""
     episodes: int = 1
@@ -43,14 +43,14 @@ class Demand:
     linear: bool = False
     """True if the joint is a slide."""
     servo: bool = False
-    """True if a position or velocity servo of the model produces the torque. Such a joint tolerates
-    less torque, and then moves more slowly.
+    """True if a position or velocity servo of the model commands the torque. Such a joint also
+    works with less torque: it moves more slowly.
     """
     swing: Swing | None = None
     """Pendulum of a swing-up task; None for other tasks."""
     model_gear: float = 1.0
     """Gear of the actuator in a third-party model, which converts its force into joint torque. The
-    demand and the motor's gear refer to the joint.
+    demand itself, and the gear ratio of a chosen motor, refer to the joint.
     """
 
 
@@ -61,7 +61,7 @@ def demand_of(
     trust: bool = False,
     motor: str | None = None,
 ) -> Demand:
-    """Return the demand of a task, run or recording on one motor; arguments as in `demands_of`.
+    """Return the demand on one motor of a task, run or recording; arguments as in `demands_of`.
 
     Raises:
         ValueError: as in `demands_of`; or `motor` is unknown, or missing if there are several.
@@ -85,7 +85,7 @@ def demand_of(
 def demands_of(
     subject: str | Path, episodes: int = EPISODES, seed: int = 0, trust: bool = False
 ) -> dict[str, Demand]:
-    """Return the demands of a task, run or recording by motor; a single motor has an empty name.
+    """Return motor -> demand of a task, run or recording; a single motor has an empty name.
 
     Args:
         subject: name of a task, which a scripted controller runs; folder of a run that was trained
@@ -93,7 +93,7 @@ def demands_of(
             `speed` [rad/s] at the joint.
         episodes: number of episodes.
         seed: seed of the first episode.
-        trust: whether to import the custom modules of a run folder's task or agent.
+        trust: True to import the custom modules of a run folder's task or agent.
 
     Raises:
         ValueError: the subject is none of these; the run was trained on another actuator; the task
@@ -131,9 +131,8 @@ def demands_of(
         env = load_config(path, trust).env
         if other_families := [actuator.family for actuator in env.actuators if actuator != IDEAL]:
             raise ValueError(
-                f"{path}: was trained on {other_families[0]}: must be ideal, whose torques are the"
-                " task's and not a motor's; train it with --actuator ideal, or name the task"
-                " instead"
+                f"{path}: was trained on {other_families[0]}: must be ideal, so that no motor"
+                " limits the torques; train it with --actuator ideal, or name the task instead"
             )
         env = env.source.with_motor_steps(env)
         episodes_run = run_episodes(load_policy(path, trust), env.make, episodes, seed)
@@ -203,13 +202,13 @@ def _demands_from_episodes(source: str, env: Any, episodes: Sequence[Any]) -> di
         if env.task == "pendulum":
             # A thin uniform rod about its end: inertia m*l^2/3, center of mass at l/2.
             length = core.l
-            inertia, gravity = (
+            inertia, gravity_torque = (
                 core.m * length**2 / 3.0 + env.joint.armature,
                 core.m * core.g * length / 2.0,
             )
             swing = Swing(
                 inertia,
-                gravity,
+                gravity_torque,
                 float(core.task.max_forces[0]),
                 env.joint.damping,
                 env.joint.friction,

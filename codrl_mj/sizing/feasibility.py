@@ -1,4 +1,4 @@
-"""Feasibility of a demand on a motor: operating points at its shaft and bounds, with remedies."""
+"""Feasibility of a demand on a motor: operating points at the rotor, and bounds with remedies."""
 
 import dataclasses
 import math
@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import Drive, GearMotor
-from codrl_mj.sizing.abilities import max_power
 from codrl_mj.sizing.demand import Demand
+from codrl_mj.sizing.limits import max_power
 from codrl_mj.sizing.swing import Swing, min_energy_gain, min_pumped_energy, min_supply_voltage
 
 
-class Operation(NamedTuple):
-    """Demand at the rotor, over T steps."""
+class OperatingPoints(NamedTuple):
+    """Operating points at the rotor that a demand requires, over T steps."""
 
     torque: np.ndarray
     """Torque of the rotor [N*m], shape (T,)."""
@@ -31,12 +31,12 @@ class Operation(NamedTuple):
     energy_drawn: float
     """Electrical energy drawn in an episode [J]; returned energy is not subtracted."""
     own_share: float
-    """Largest torque for rotor acceleration and friction, over the largest joint torque. It is a
-    lower bound if the rotor's inertia is unknown (0).
+    """Largest torque that rotor acceleration and friction take, over the largest torque of the
+    load, both at the joint. A lower bound if the rotor's inertia is unknown (0).
     """
 
 
-def operation(demand: Demand, drive: Drive) -> Operation:
+def operating_points(demand: Demand, drive: Drive) -> OperatingPoints:
     """Return the operating points of a motor for a demand.
 
     With N turns of the rotor for one turn of the joint (1/arm on a slide),
@@ -46,9 +46,9 @@ def operation(demand: Demand, drive: Drive) -> Operation:
         V >= |R i + L di/dt + N kE omega| + R_supply |i|, with and without L di/dt.
 
     tau_c includes Stribeck friction. di is the change of the current from the step before, which
-    may be the last one of the previous episode. If the motor brakes or holds, eta is 1, because
-    then the losses of the gear help. Energies use the mean speed in a step, all other values the
-    speed at its start.
+    may be the last one of the previous episode. If the motor brakes or holds, eta is 1: the losses
+    of the gear then help, and are ignored. Energies use the mean speed in a step, all other values
+    the speed at its start.
     """
     motor, added, arm = drive.motor, drive.additions, drive.arm_radius
     stribeck = motor.stribeck(demand.speed / arm) / arm
@@ -62,7 +62,7 @@ def operation(demand: Demand, drive: Drive) -> Operation:
     mean_speed = speed + demand.acceleration * demand.duration / (2.0 * arm)
     power = (motor.resistance * current + motor.back_emf_constant * mean_speed) * current
     square = float(current**2 @ demand.duration)
-    return Operation(
+    return OperatingPoints(
         torque=torque,
         speed=speed,
         current=current,
@@ -100,16 +100,18 @@ VERDICTS = (SURELY, DEPENDS, TRY_IT, HOPELESS, SURELY_NOT)
 SUFFICIENT = ("voltage", "current", "heat", "rotor", "friction")
 """Bounds that are sufficient together."""
 MAX_ROTOR_SHARE = 0.5
-"""Largest share of the load for rotor and friction. The task limits the command of a policy, which
-has to supply this share in addition to the load.
+"""Largest torque for rotor and friction, over the largest torque of the load. A policy has to
+command both together, and the task limits its command.
 """
 MAX_FRICTION_SHARE = 0.05
-"""Largest share of the load for Coulomb friction at the joint. With this much friction, policies
-trained without it lost at most 0.05 of the score on five tasks and 0.10 on Mountain Car, and with
-twice as much up to 0.18 (docs/results/actuators.md).
+"""Largest Coulomb friction at the joint, over the largest torque of the load. With this much
+friction, policies trained without it lost at most 0.05 of the score on five tasks and 0.10 on
+Mountain Car; with twice as much, up to 0.18 (docs/results/actuators.md).
 """
 HOPELESS_RATIO = 10.0
-"""Ratio of needed to available that is hopeless: in simulations no motor with over 7 succeeded."""
+"""Ratio of needed to available above which a motor is hopeless. In simulations, no motor with a
+ratio above 7 succeeded.
+"""
 MAX_PEAK_SHARE = 0.01
 """Share of time in which peaks are ignored: a policy can avoid them, for example at an impact."""
 
@@ -121,7 +123,7 @@ class Bound:
     name: str
     """Name of the bound."""
     formula: str
-    """Quantity that must not exceed what the motor has."""
+    """Formula of the quantity whose `needed` value must not exceed the `available` one."""
     needed: float
     """Value that the demand needs."""
     available: float
@@ -154,10 +156,10 @@ class Feasibility:
 
     bounds: tuple[Bound, ...]
     """All applicable bounds."""
-    operation: Operation
+    operating_points: OperatingPoints
     """Operating points of the motor."""
     margin: float
-    """Smallest margin of voltage, current and heat; see `margin`."""
+    """Smallest reserve of voltage, peak and rms current; see `margin`."""
 
     @property
     def verdict(self) -> str:
@@ -188,8 +190,11 @@ class Feasibility:
         )
 
 
-def margin(drive: Drive, required: Operation, continuous_current: float | None) -> float:
-    """Return the smallest margin of voltage, peak and continuous current, negative if short."""
+def margin(drive: Drive, required: OperatingPoints, continuous_current: float | None) -> float:
+    """Return the smallest reserve of voltage, peak and rms current, as a share of its limit.
+
+    It is negative if a limit is exceeded.
+    """
     return 1.0 - max(
         float(required.voltage.max()) / drive.voltage_limit,
         float(np.abs(required.current).max()) / drive.controller.max_current,
@@ -203,9 +208,9 @@ def feasibility(
     """Judge whether a motor can meet a demand.
 
     The bounds of `SUFFICIENT` are sufficient together. `stall` and `power` are necessary to follow
-    the demand, and exclude a motor if the demand is exact. Otherwise another policy may need less,
-    so that they exclude only a motor without any stall torque. `swing` is necessary for every
-    policy.
+    the demand exactly, so they exclude a motor if the demand is exact. Otherwise another policy may
+    need less: then only `stall` can exclude a motor, if it has no torque at standstill. `swing` is
+    necessary for every policy.
 
     Args:
         drive: motor with gear and supply; a rotor inertia of 0 counts as unknown.
@@ -220,12 +225,16 @@ def feasibility(
             f"{drive!r}: must be a codrl_mj.actuators.Drive, a motor with gear and supply;"
             " codrl_mj.sizing.find_drive returns one for a name"
         )
-    required, unmet = operation(demand, drive), SURELY_NOT if demand.exact else TRY_IT
+    required, unmet_verdict = (
+        operating_points(demand, drive),
+        SURELY_NOT if demand.exact else TRY_IT,
+    )
     bounds = []
-    conditions = _conditions(drive, demand, required, continuous_current, unmet)
+    conditions = _conditions(drive, demand, required, continuous_current, unmet_verdict)
     for name, formula, load, available, unit, verdicts, remedy in conditions:
         needed = float(np.max(load))
         holds = needed <= available
+        # Heat grows with the squared current: 10 times the heat is sqrt(10) times the current.
         verdict, hopeless_limit = (
             verdicts[not holds],
             available * (math.sqrt(HOPELESS_RATIO) if name == "heat" else HOPELESS_RATIO),
@@ -242,7 +251,7 @@ def feasibility(
             verdict = HOPELESS
         if math.isnan(available):
             verdict = DEPENDS
-        elif demand.servo and name in _LATE_SERVO:
+        elif demand.servo and name in _EASED_BY_SERVO:
             remedy = "a servo asks for less if the motor is slower: evaluate the run on this motor"
         bounds.append(
             Bound(name, formula, needed, available, unit, holds, verdict, "" if holds else remedy)
@@ -259,21 +268,25 @@ def feasibility(
 
 _MAY_BE_HOPELESS = ("voltage", "current", "heat", "stall")
 """Bounds whose shortage can be hopeless; not power, because a policy may move more slowly."""
-_LATE_SERVO = ("voltage", "current", "rotor", "power")
-"""Bounds on which a position or velocity servo asks for less on a real motor: on ideal motors it is
-as fast as its force allows.
+_EASED_BY_SERVO = ("voltage", "current", "rotor", "power")
+"""Bounds whose needed value a position or velocity servo lowers: on an ideal motor it moves as
+fast as its force allows, on a real motor it moves more slowly and needs less.
 """
 _Row = tuple[str, str, Any, float, str, tuple[str, str], str]
 
 
 def _conditions(
-    drive: Drive, demand: Demand, required: Operation, continuous: float | None, unmet: str
+    drive: Drive,
+    demand: Demand,
+    required: OperatingPoints,
+    continuous: float | None,
+    unmet_verdict: str,
 ) -> Iterator[_Row]:
     """Yield name, formula, load, available, unit, verdicts and remedy of the general bounds.
 
-    These bounds are sufficient together: voltage and current at every operating point, heat and,
-    unless the demand is exact, the shares of rotor and friction. These are necessary to follow the
-    demand: torque at standstill, and power with any gear.
+    Sufficient together: voltage and current at every operating point, heat and, unless the demand
+    is exact, the shares of rotor and friction. Necessary to follow the demand exactly: torque at
+    standstill, and power with any gear.
     """
     motor, limit, max_current = drive.motor, drive.voltage_limit, drive.controller.max_current
     currents, unit = np.abs(required.current), "N" if demand.linear else "N*m"
@@ -285,7 +298,7 @@ def _conditions(
         required.voltage,
         limit,
         "V",
-        (SURELY, unmet),
+        (SURELY, unmet_verdict),
         remedy,
     )
     remedy = (
@@ -293,7 +306,7 @@ def _conditions(
         f" {largest / max_current:.3g} times"
     )
     remedy += _time_within(currents, max_current, "A")
-    yield "current", "|i|, largest", currents, max_current, "A", (SURELY, unmet), remedy
+    yield "current", "|i|, largest", currents, max_current, "A", (SURELY, unmet_verdict), remedy
     rating, remedy = (
         math.nan,
         f"its continuous current is not known, must be at least {required.rms_current:.3g} A",
@@ -315,7 +328,7 @@ def _conditions(
         - drive.additions.friction
     )
     stall_torque -= motor.stribeck_friction / drive.arm_radius
-    verdicts = TRY_IT, unmet if stall_torque > 0.0 else SURELY_NOT
+    verdicts = TRY_IT, unmet_verdict if stall_torque > 0.0 else SURELY_NOT
     remedy = "raise the supply, the largest current or the gear"
     yield "stall", "|tau| except braking, largest", driving, stall_torque, unit, verdicts, remedy
     peak = int(np.argmax(power))
@@ -342,20 +355,20 @@ def _conditions(
         needed,
         max_power(drive),
         "W",
-        (TRY_IT, unmet),
+        (TRY_IT, unmet_verdict),
         remedy,
     )
 
 
 def _time_within(load: np.ndarray, available: float, unit: str) -> str:
-    """Return text with the share of time in which the available value suffices."""
+    """Return text with the share of steps in which the available value suffices."""
     return (
         f" ({available:.4g} {unit} suffice for"
         f" {math.floor(100.0 * float(np.mean(load <= available)))}% of the time)"
     )
 
 
-def _share_bounds(drive: Drive, demand: Demand, required: Operation) -> Iterator[_Row]:
+def _share_bounds(drive: Drive, demand: Demand, required: OperatingPoints) -> Iterator[_Row]:
     """Yield the bounds on the shares of the largest load that rotor and friction take."""
     # With x times the gear ratio, the inertial part grows by x^2 and the friction by x. The scale
     # is the positive root of inertial*x^2 + friction*x = MAX_ROTOR_SHARE.
@@ -400,24 +413,24 @@ def friction_share(drive: Drive, demand: Demand) -> float:
 
 
 def _unknown_rotor(drive: Drive, demand: Demand, continuous: float | None) -> list[Bound]:
-    """Return the bound on an unknown rotor inertia; none if any inertia suffices."""
+    """Return the bound on an unknown rotor inertia; none if even 1 kg*m^2 is light enough."""
 
-    def suffices(inertia: float) -> bool:
+    def is_light_enough(inertia: float) -> bool:
         heavier = drive.replaced({"motor.rotor_inertia": inertia})
-        required = operation(demand, heavier)
+        required = operating_points(demand, heavier)
         return margin(heavier, required, continuous) >= 0.0 and (
             demand.exact or required.own_share <= MAX_ROTOR_SHARE
         )
 
     low, high = 1e-12, 1.0
-    if suffices(high):
+    if is_light_enough(high):
         return []
     remedy, max_inertia = "its inertia is not known: give rotor_inertia", math.nan
-    if suffices(low):
+    if is_light_enough(low):
         # Bisection on a logarithmic scale.
         while high > 1.001 * low:
             middle = math.sqrt(low * high)
-            low, high = (middle, high) if suffices(middle) else (low, middle)
+            low, high = (middle, high) if is_light_enough(middle) else (low, middle)
         remedy, max_inertia = f"{remedy}, must be at most {low:.3g} kg*m^2 at the motor", low
     return [
         Bound(

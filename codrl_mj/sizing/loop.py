@@ -21,20 +21,20 @@ from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 from codrl_mj.fields import check_memory
 
 CurrentLoopActuator = Drive | DCMotorActuator
-# Memory [bytes] of a sample in the step responses, over all kinds of anti-windup.
+# Memory [bytes] of the step responses with all kinds of anti-windup, for each sample.
 _SAMPLE_SIZE = 500
 RATES = (10e3, 20e3, 40e3)
 """Common sample rates of drives [Hz]."""
 
 
 def is_closed(actuator: CurrentLoopActuator) -> bool:
-    """Return True if the loop is closed, which means that a gain on the error is not 0."""
+    """Return True if the current loop is closed: a gain on the error is not 0."""
     return isinstance(actuator, Drive) or any(
         (actuator.controller.kp, actuator.controller.ki, actuator.controller.kd)
     )
 
 
-def gains(drive: Drive) -> tuple[float, float]:
+def loop_gains(drive: Drive) -> tuple[float, float]:
     """Return the proportional gain [V/A] and the integral gain [V/(A*s)] of a drive's loop."""
     loop = drive.controller
     if loop.kp != 0.0 or loop.ki != 0.0:
@@ -63,9 +63,10 @@ class _Sampled(NamedTuple):
     gains: tuple[float, float]  # proportional [V/A], integral [V/(A*s)]
     numerator: np.ndarray  # from error to sampled current
     denominator: np.ndarray
-    forward: np.ndarray  # numerator from reference to sampled current
+    reference_numerator: np.ndarray  # numerator from reference to sampled current
     initial_gain: float  # voltage per ampere in the first sample of a step [V/A]
-    constant: float  # time constant of the designed loop, or of the winding with explicit gains [s]
+    # Time constant [s] of the designed loop; with explicit gains, that of the winding.
+    time_constant: float
     max_current: float = math.inf  # largest reference current [A]
     delayed: bool = False  # True if the voltage is applied one sample late
 
@@ -73,17 +74,19 @@ class _Sampled(NamedTuple):
 def _sampled(actuator: CurrentLoopActuator, timestep: float | None) -> _Sampled:
     """Return the loop of a drive, or of a `DCMotorActuator` with a mechanical step [s]."""
     resistance, inductance = actuator.winding
-    constant = inductance / resistance
+    time_constant = inductance / resistance
     if isinstance(actuator, Drive):
-        (kp, ki), rate = gains(actuator), actuator.controller.sample_rate
-        time = 1.0 / rate
+        (kp, ki), rate = loop_gains(actuator), actuator.controller.sample_rate
+        period = 1.0 / rate
         if actuator.controller.kp == 0.0 and actuator.controller.ki == 0.0:
-            constant = 1.0 / (
+            time_constant = 1.0 / (
                 2.0 * math.pi * (actuator.controller.bandwidth or DEFAULT_BANDWIDTH * rate)
             )
-        decay = math.exp(-resistance * time / inductance)
-        input_gain = -math.expm1(-resistance * time / inductance) / resistance  # [A/V] in a sample
-        numerator = np.array([input_gain * (kp + ki * time), -input_gain * kp])
+        decay = math.exp(-resistance * period / inductance)
+        input_gain = (
+            -math.expm1(-resistance * period / inductance) / resistance
+        )  # [A/V] in a sample
+        numerator = np.array([input_gain * (kp + ki * period), -input_gain * kp])
         delay = [1.0, 0.0] if actuator.controller.delayed else [1.0]
         denominator = np.polymul(np.polymul([1.0, -decay], [1.0, -1.0]), delay)
         max_current, delayed = actuator.controller.max_current, actuator.controller.delayed
@@ -94,7 +97,7 @@ def _sampled(actuator: CurrentLoopActuator, timestep: float | None) -> _Sampled:
             denominator,
             numerator,
             kp + ki / rate,
-            constant,
+            time_constant,
             max_current,
             delayed,
         )
@@ -104,14 +107,14 @@ def _sampled(actuator: CurrentLoopActuator, timestep: float | None) -> _Sampled:
             " is sampled within it"
         )
     rate, loop = actuator.controller.substeps / timestep, actuator.controller
-    time = 1.0 / rate
+    period = 1.0 / rate
     pid, pid_denominator = np.array([loop.kp]), np.array([1.0])  # from error [A] to voltage [V]
     for gain, term_numerator, term_denominator in (
-        (loop.ki, [time, 0.0], [1.0 + loop.integral_leak * time, -1.0]),
+        (loop.ki, [period, 0.0], [1.0 + loop.integral_leak * period, -1.0]),
         (
             loop.kd,
             [1.0, -1.0],
-            [time + loop.derivative_time_constant, -loop.derivative_time_constant],
+            [period + loop.derivative_time_constant, -loop.derivative_time_constant],
         ),
     ):
         if gain:
@@ -122,13 +125,19 @@ def _sampled(actuator: CurrentLoopActuator, timestep: float | None) -> _Sampled:
                 ),
                 np.polymul(pid_denominator, term_denominator),
             )
-    numerator = pid * time / inductance
-    denominator = np.polymul(pid_denominator, [1.0, resistance * time / inductance - 1.0])
+    numerator = pid * period / inductance
+    denominator = np.polymul(pid_denominator, [1.0, resistance * period / inductance - 1.0])
     # The feed-forward bypasses the error, so it appears only in the numerator from the reference.
-    forward = np.polyadd(numerator, loop.kff * time / inductance * pid_denominator)
+    reference_numerator = np.polyadd(numerator, loop.kff * period / inductance * pid_denominator)
     initial_gain = pid[0] / pid_denominator[0] + loop.kff
     return _Sampled(
-        rate, (loop.kp, loop.ki), numerator, denominator, forward, initial_gain, constant
+        rate,
+        (loop.kp, loop.ki),
+        numerator,
+        denominator,
+        reference_numerator,
+        initial_gain,
+        time_constant,
     )
 
 
@@ -146,7 +155,7 @@ def closed_loop(actuator: CurrentLoopActuator, timestep: float | None = None) ->
 
     loop = _sampled(actuator, timestep)
     return control.TransferFunction(
-        loop.forward, np.polyadd(loop.denominator, loop.numerator), 1.0 / loop.rate
+        loop.reference_numerator, np.polyadd(loop.denominator, loop.numerator), 1.0 / loop.rate
     )
 
 
@@ -204,7 +213,7 @@ def simulate_loop(
         speed: constant speed of the rotor [rad/s].
         timestep: mechanical timestep of a `DCMotorActuator` [s]; not used for a drive.
     """
-    time = 1.0 / _sampled(actuator, timestep).rate
+    period = 1.0 / _sampled(actuator, timestep).rate
     state_type: Any = actuator.State
     state = state_type(*[0.0] * len(state_type._fields))
     if isinstance(actuator, Drive):
@@ -224,24 +233,25 @@ def simulate_loop(
         sampled_current = state.current
         torque = actuator.motor.torque_constant * float(reference)
         state, _, signals = actuator.advance(
-            parameters, time, state, Inputs(torque, 0.0, speed, 0.0, 0.0)
+            parameters, period, state, Inputs(torque, 0.0, speed, 0.0, 0.0)
         )
         rows.append((signals.reference_current, sampled_current, signals.voltage))
-    return Response(time * np.arange(len(rows)), *np.array(rows).T)
+    return Response(period * np.arange(len(rows)), *np.array(rows).T)
 
 
 def small_step_response(actuator: CurrentLoopActuator, timestep: float | None = None) -> Response:
     """Return the response from rest to a current step that does not saturate.
 
-    The step is the smallest of V/R/10, the current whose first sample takes half the voltage, and
-    `max_current`; it is 1 A if the voltage is unlimited. It lasts 20 time constants of the designed
-    loop, or of the winding with explicit gains, and 100 to 20000 samples.
+    The step is the smallest of V/R/10, the current whose first sample needs half the voltage, and
+    `max_current`; it is 1 A if all of these are infinite. It lasts 20 time constants (of the
+    designed loop, or of the winding with explicit gains), but at least 100 and at most 20000
+    samples.
     """
     loop, limit = _sampled(actuator, timestep), actuator.voltage_limit
     amplitude = min(
         0.1 * limit / actuator.winding[0], 0.5 * limit / loop.initial_gain, loop.max_current
     )
-    samples = min(max(math.ceil(20.0 * loop.constant * loop.rate), 100), 20_000)
+    samples = min(max(math.ceil(20.0 * loop.time_constant * loop.rate), 100), 20_000)
     return simulate_loop(
         actuator,
         np.full(samples, amplitude if math.isfinite(amplitude) else 1.0),
@@ -250,8 +260,12 @@ def small_step_response(actuator: CurrentLoopActuator, timestep: float | None = 
 
 
 @dataclasses.dataclass(frozen=True)
-class LoopDesign:
-    """Figures of merit of a current loop; NaN for a crossing above half the sample rate."""
+class LoopAnalysis:
+    """Margins, bandwidth and step response of a current loop.
+
+    Frequencies at which a response crosses a level are NaN if there is none below half the sample
+    rate.
+    """
 
     sample_rate: float
     """Sample rate [Hz]."""
@@ -277,7 +291,7 @@ class LoopDesign:
     """Overshoot of a small step, as a share of it."""
 
 
-def design(actuator: CurrentLoopActuator, timestep: float | None = None) -> LoopDesign:
+def analyze_loop(actuator: CurrentLoopActuator, timestep: float | None = None) -> LoopAnalysis:
     """Analyze a current loop: margins of its transfer function and a simulated step.
 
     Raises:
@@ -293,17 +307,17 @@ def design(actuator: CurrentLoopActuator, timestep: float | None = None) -> Loop
     # A search on the unit circle is accurate even for slow loops and the pole at z = 1, unlike the
     # polynomial roots that python-control uses. At half the sample rate (z = -1) the loop is real:
     # without an earlier crossing, the gain margin is defined there.
-    phase_crossover_ = _first_below(lambda z: -open_transfer(z).imag, loop.rate)
-    phase_crossover_ = 0.5 * loop.rate if math.isnan(phase_crossover_) else phase_crossover_
+    phase_crossover = _first_below(lambda z: -open_transfer(z).imag, loop.rate)
+    phase_crossover = 0.5 * loop.rate if math.isnan(phase_crossover) else phase_crossover
     crossover = _first_below(lambda z: abs(open_transfer(z)) - 1.0, loop.rate)
     at_crossover = open_transfer(_point(crossover, loop.rate)) if crossover > 0.0 else math.nan
-    return LoopDesign(
+    return LoopAnalysis(
         loop.rate,
         loop.delayed,
         *loop.gains,
-        gain_margin=float(1.0 / abs(open_transfer(_point(phase_crossover_, loop.rate)))),
+        gain_margin=float(1.0 / abs(open_transfer(_point(phase_crossover, loop.rate)))),
         phase_margin=180.0 + math.degrees(np.angle(at_crossover)),
-        phase_crossover=phase_crossover_,
+        phase_crossover=phase_crossover,
         crossover=crossover,
         bandwidth=_first_below(lambda z: abs(closed_transfer(z)) - math.sqrt(0.5), loop.rate),
         settling_time=response.settling_time(),
@@ -311,21 +325,21 @@ def design(actuator: CurrentLoopActuator, timestep: float | None = None) -> Loop
     )
 
 
-def designs(drive: Drive) -> dict[tuple[float, bool], LoopDesign | str]:
-    """Return (rate, delayed) -> `design` at the drive's rate and at `RATES`, or an error as text.
+def analyze_sample_rates(drive: Drive) -> dict[tuple[float, bool], LoopAnalysis | str]:
+    """Return (rate, delayed) -> `analyze_loop` at the drive's rate and `RATES`, or an error text.
 
-    All designs have the drive's bandwidth, or its gains if they are explicit.
+    All loops are designed for the drive's bandwidth, or have its gains if these are explicit.
     """
-    designs_by_rate: dict[tuple[float, bool], LoopDesign | str] = {}
+    analyses: dict[tuple[float, bool], LoopAnalysis | str] = {}
     for rate in sorted({drive.controller.sample_rate, *RATES}):
         for delayed in (False, True):
             try:
-                designs_by_rate[rate, delayed] = design(
+                analyses[rate, delayed] = analyze_loop(
                     drive.replaced({"controller.sample_rate": rate, "controller.delayed": delayed})
                 )
             except ValueError as error:
-                designs_by_rate[rate, delayed] = str(error)
-    return designs_by_rate
+                analyses[rate, delayed] = str(error)
+    return analyses
 
 
 def _point(frequency: Any, rate: float) -> Any:
@@ -367,7 +381,7 @@ class StepResponses(NamedTuple):
     unreachable: float
     """Reference current that the drive cannot reach [A]; it lasts 20 ms."""
     reachable: float
-    """Reference current after the unreachable one [A]."""
+    """Reference current after the unreachable one [A], which the drive can reach."""
     recoveries: dict[str, Response]
     """Kind of anti-windup -> response to the unreachable and then the reachable current."""
 
@@ -375,8 +389,8 @@ class StepResponses(NamedTuple):
 def step_responses(drive: Drive) -> StepResponses:
     """Return a drive's small step response, and its recovery from saturation with each anti-windup.
 
-    The unreachable reference is 1.8 times the largest current at `StepResponses.speed`, and the
-    reachable one 0.4 times.
+    The unreachable reference is 1.8 times the largest current that the voltage allows at
+    `StepResponses.speed`, the reachable one 0.4 times.
 
     Raises:
         ValueError: the loop is unstable (the message has the spectral radius and a remedy), or

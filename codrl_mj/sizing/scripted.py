@@ -16,20 +16,21 @@ HOLD_ANGLE, HOLD_SPEED = 0.5, 3.0
 
 
 def swing_up_and_hold(states: np.ndarray) -> np.ndarray:
-    """Return the Pendulum's torques: energy pumping at full torque, then 12 theta + 4 omega.
+    """Return torques for the Pendulum: energy pumping at full torque, then 12 theta + 4 omega.
 
     Source of the pumping: Astrom and Furuta (2000). The rod's energy relative to upright is
     omega^2/6 + 5 (cos(theta) - 1) J.
     """
     angle, speed = (states[:, 0] + np.pi) % (2 * np.pi) - np.pi, states[:, 1]
     missing_energy = 5.0 * (1.0 - np.cos(angle)) - speed**2 / 6.0
+    # `Scripted` clips infinite torques to the largest one.
     pump = np.inf * np.sign(missing_energy) * np.where(speed < 0.0, -1.0, 1.0)
     near_upright = (np.abs(angle) < HOLD_ANGLE) & (np.abs(speed) < HOLD_SPEED)
     return np.where(near_upright, -12.0 * angle - 4.0 * speed, np.nan_to_num(pump))
 
 
 def swing_up_and_balance(states: np.ndarray) -> np.ndarray:
-    """Return Furuta's torques: energy pumping with a centered arm, then balancing by an LQR.
+    """Return torques for the Furuta pendulum: energy pumping, arm centering, then an LQR.
 
     Source of the pumping: Astrom and Furuta (2000). The rod's energy relative to upright is 6.66e-5
     speed^2 + 0.0152 (cos(angle) - 1) J. The LQR's gains are for 20 ms steps, with weights 1, 1,
@@ -45,26 +46,29 @@ def swing_up_and_balance(states: np.ndarray) -> np.ndarray:
 
 
 def balance(states: np.ndarray) -> np.ndarray:
-    """Return CartPole's forces: full force toward the side to which the pole falls."""
+    """Return forces for CartPole: full force toward the side to which the pole falls."""
     return np.inf * (states @ np.array([0.1, 0.4, 5.0, 1.5]))
 
 
 def energy_pumping(task: Task) -> Law:
-    """Return a law of full force in the direction of motion; at rest the direction is random."""
+    """Return a control law: full force in the direction of motion, at rest in a random one."""
     generator = np.random.default_rng(0)
 
     def law(states: np.ndarray) -> np.ndarray:
-        kick, speed = generator.choice([-1.0, 1.0], len(states)), states[:, task.speed_indices[0]]
-        return np.inf * np.where(np.abs(speed) > 1e-6, speed, kick)
+        random_direction, speed = (
+            generator.choice([-1.0, 1.0], len(states)),
+            states[:, task.speed_indices[0]],
+        )
+        return np.inf * np.where(np.abs(speed) > 1e-6, speed, random_direction)
 
     return law
 
 
 class Scripted:
-    """Policy that applies a law to states and returns the task's actions."""
+    """Policy that applies a control law to states and returns the task's actions."""
 
     def __init__(self, task: Task) -> None:
-        """Choose the law of a task; tasks without one get energy pumping."""
+        """Choose the control law of a task; energy pumping is the default."""
         laws: dict[str, tuple[str, Law]] = {
             "pendulum": ("scripted swing-up and hold", swing_up_and_hold),
             "cartpole": ("scripted balancing", balance),

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import Drive, Supply
-from codrl_mj.sizing.abilities import highest_current
+from codrl_mj.sizing.limits import highest_current
 
 _ANGLES = np.linspace(-np.pi, np.pi, 1001)
 _STEP = _ANGLES[1] - _ANGLES[0]
@@ -23,24 +23,24 @@ class Swing(NamedTuple):
 
     inertia: float
     """Inertia about its hinge [kg*m^2]."""
-    gravity: float
-    """Largest torque G of gravity: m*g times the distance from hinge to center of mass [N*m]."""
-    largest: float
+    gravity_torque: float
+    """Largest torque of gravity [N*m]: m*g times the distance from hinge to center of mass."""
+    max_torque: float
     """Largest torque [N*m] that a policy can command."""
     damping: float = 0.0
     """Damping of the hinge [N*m*s/rad]."""
     friction: float = 0.0
     """Coulomb friction of the hinge [N*m]."""
 
-    def potential(self, angle: Any) -> Any:
-        """Return the potential energy [J]."""
-        return self.gravity * (1.0 - np.cos(angle))
+    def potential_energy(self, angle: Any) -> Any:
+        """Return the potential energy [J] at an angle [rad]; 0 when the pendulum hangs."""
+        return self.gravity_torque * (1.0 - np.cos(angle))
 
     def speed(self, kinetic: Any, drive: Drive) -> Any:
         """Return the speed [rad/s] at a kinetic energy [J] of pendulum and rotor; 0 if negative."""
         return np.sqrt(2.0 * np.maximum(kinetic, 0.0) / (self.inertia + drive.additions.armature))
 
-    def push(self, speed: Any, drive: Drive) -> Any:
+    def max_net_torque(self, speed: Any, drive: Drive) -> Any:
         """Return the largest net torque [N*m] in the direction of motion.
 
         It is min(tau_max, N eta kT min((V - N kE omega)/R, i_max)) minus friction, where R is the
@@ -53,7 +53,7 @@ class Swing(NamedTuple):
         )
         current = np.minimum(current, drive.controller.max_current)
         torque = np.minimum(
-            self.largest, ratio * motor.torque_constant * motor.gear_efficiency * current
+            self.max_torque, ratio * motor.torque_constant * motor.gear_efficiency * current
         )
         return torque - self.friction - added.friction - (self.damping + added.damping) * speed
 
@@ -61,47 +61,50 @@ class Swing(NamedTuple):
 def min_pumped_energy(swing: Swing, drive: Drive) -> float:
     """Return an estimate of the smallest energy [J] that full force adds in a swing.
 
-    It is the minimum over E of the integral of push(omega) over theta, with omega = sqrt(2 (E -
-    potential(theta)) / I): the energy is treated as constant during a swing. It is infinite if the
-    torque lifts the pendulum without a swing.
+    The net torque is integrated over the angle, with the speed of a constant energy E, and the
+    smallest integral over E is returned: the energy is treated as constant during a swing. The
+    result is infinite if the standstill torque lifts the pendulum without a swing.
     """
-    if swing.push(0.0, drive) >= swing.gravity:
+    if swing.max_net_torque(0.0, drive) >= swing.gravity_torque:
         return math.inf
-    kinetic = 2.0 * swing.gravity * _LEVELS[:, np.newaxis] - swing.potential(_ANGLES)
-    net = np.where(kinetic > 0.0, swing.push(swing.speed(kinetic, drive), drive), 0.0)
+    kinetic = 2.0 * swing.gravity_torque * _LEVELS[:, np.newaxis] - swing.potential_energy(_ANGLES)
+    net = np.where(kinetic > 0.0, swing.max_net_torque(swing.speed(kinetic, drive), drive), 0.0)
     return float(net.sum(axis=1).min() * _STEP)
 
 
 def min_energy_gain(swing: Swing, drive: Drive) -> float:
-    """Return the smallest gain of energy [J] from rest to rest in a swing, for the best controller.
+    """Return the smallest energy [J] gained between two turning points by the best controller.
 
-    dE/dtheta = push(omega(E - potential(theta))) is integrated from each turning point. Any other
-    controller adds less energy at every angle, so if this gain is not positive at some amplitude,
-    no controller exceeds that amplitude. Two effects are ignored: inductance, which only delays the
-    torque, and the speed's hold over a step. The gain is infinite if the swing goes over the top or
-    comes to rest where the standstill torque lifts the pendulum further.
+    dE/dtheta = `max_net_torque` at the speed of the present energy is integrated from each turning
+    point. Any other controller adds less energy at every angle, so if this gain is not positive at
+    some amplitude, no controller exceeds that amplitude. Two effects are ignored:
+    inductance, which only delays the torque, and that the actuator sees a constant speed in a step.
+    The gain is infinite if the swing goes over the top or
+    stops where the standstill torque lifts the pendulum further.
     """
-    standstill_torque = swing.push(0.0, drive)
-    if standstill_torque >= swing.gravity:
+    standstill_torque = swing.max_net_torque(0.0, drive)
+    if standstill_torque >= swing.gravity_torque:
         return math.inf
     starts = np.arccos(1.0 - 2.0 * _LEVELS)
     # Beyond this angle the standstill torque exceeds gravity and lifts the pendulum without a
     # swing.
-    lift_angle = np.pi - math.asin(max(standstill_torque, 0.0) / swing.gravity)
+    lift_angle = np.pi - math.asin(max(standstill_torque, 0.0) / swing.gravity_torque)
     starts = starts[starts < lift_angle]
-    energy, furthest, moving = swing.potential(starts), -starts, np.ones(len(starts), bool)
+    energy, max_angle, moving = swing.potential_energy(starts), -starts, np.ones(len(starts), bool)
     # All swings are integrated at once; each one starts when the angle passes its turning point.
     for angle in _ANGLES[:-1]:
         started = moving & (angle >= -starts)
-        new_energy = energy + _STEP * swing.push(
-            swing.speed(energy - swing.potential(angle), drive), drive
+        new_energy = energy + _STEP * swing.max_net_torque(
+            swing.speed(energy - swing.potential_energy(angle), drive), drive
         )
         energy = np.where(started, new_energy, energy)
-        moving &= ~started | (energy > swing.potential(angle + _STEP))
-        furthest = np.where(started & moving, angle + _STEP, furthest)
-    completed = furthest >= lift_angle
+        moving &= ~started | (energy > swing.potential_energy(angle + _STEP))
+        max_angle = np.where(started & moving, angle + _STEP, max_angle)
+    completed = max_angle >= lift_angle
     return float(
-        np.where(completed, np.inf, swing.potential(furthest) - swing.potential(starts)).min()
+        np.where(
+            completed, np.inf, swing.potential_energy(max_angle) - swing.potential_energy(starts)
+        ).min()
     )
 
 

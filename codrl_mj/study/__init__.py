@@ -13,14 +13,14 @@ from codrl_mj.study.pages import markdown_table, read_conclusions, read_csv, wri
 from codrl_mj.study.parallel import Workers
 from codrl_mj.study.program import Program, main
 from codrl_mj.study.questions import Contrast, Question, Scores, Verdict, judge
-from codrl_mj.study.trials import Arm, Collected, Grid, Trial, run_rows, trial_rows
+from codrl_mj.study.trials import Arm, Grid, StudyResults, Trial, run_rows, trial_rows
 
 __all__ = [
     "Arm",
     "Trial",
     "Grid",
     "Workers",
-    "Collected",
+    "StudyResults",
     "Contrast",
     "Question",
     "Scores",

@@ -1,12 +1,11 @@
 """Recommendation for an actuator on a task, from a simulated bench test and the study's results.
 
-The bench converts the actuator into a severity on each axis of the study. The loss of policies
-trained on ideal forces is interpolated, policy by policy, between the severities that the study
-tested, and the losses of all axes are added. For policies trained on random actuators or through
-the actuator, a test of the study at severities at least as large on every axis gives an upper
-bound, and a test at severities at most as large a lower bound. A `Measurement` needs none of these
-assumptions: it trains and tests new policies, in any environment, and applies the same rule
-(`decide`).
+The bench test gives the actuator a severity on each axis of the study. The loss of policies trained
+on ideal forces is interpolated, policy by policy, between the severities that the study tested, and
+the losses of all axes are added. For policies trained on random actuators or through the actuator,
+a study's test gives an upper bound if its severities are at least as large on every axis, and a
+lower bound if they are at most as large. A `Measurement` needs none of these assumptions: it trains
+and tests new policies, in any environment, and applies the same rule (`decide`).
 """
 
 import dataclasses
@@ -19,24 +18,24 @@ import numpy as np
 from codrl_mj.actuators import IDEAL as IDEAL_ACTUATOR
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate
-from codrl_mj.study.axes import AXES, FLOORS, REAL, SECONDS, generic, ideal, study_env
+from codrl_mj.study.axes import AXES, FLOORS, REAL, SECONDS, generic_arm, ideal_arm, study_env
 from codrl_mj.study.bench import (
-    Delivery,
+    ActuatorResponse,
     measure_on_task,
+    measure_with_larger_command,
     redesign_loop,
     severities,
-    with_larger_command,
 )
 from codrl_mj.study.evidence import Evidence, Loss, Outcome, sum_outcomes
 from codrl_mj.study.questions import MARGIN, Scores
-from codrl_mj.study.trials import Arm, Collected, Grid, Trial
+from codrl_mj.study.trials import Arm, Grid, StudyResults, Trial
 from codrl_mj.training import TrainConfig, load_config
 
 IDEAL, COMMAND, LOOP = "train on ideal", "command more", "design the loop"
 RANDOMIZE, THROUGH = "randomise", "train through it"
 BUY, MEASURE = "buy another", "measure it"
 RANDOM = ("generic", "random")
-"""Arms trained on random actuators, one of each study; their ranges differ."""
+"""Arms trained on random actuators: one in each of the two studies, with different ranges."""
 OPTIONS = (IDEAL, COMMAND, LOOP, RANDOMIZE, THROUGH)
 """Options for an actuator, in order of effort. The other two verdicts are `BUY` and `MEASURE`."""
 
@@ -54,15 +53,15 @@ class LossBounds(NamedTuple):
         return {"most": self.upper, "least": self.lower}
 
     @property
-    def bound(self) -> str:
-        """Prefix of the printed number: "at least ", "at most " or empty."""
+    def prefix(self) -> str:
+        """Prefix of the loss as text: "at least ", "at most ", or empty if it is exact."""
         if self.upper is None:
             return "at least "
         return "" if self.upper is self.lower else "at most "
 
 
 def decide(options: Mapping[str, LossBounds]) -> str:
-    """Return the recommended option, for predicted and for measured losses alike.
+    """Return the recommended option; the rule is the same for predicted and measured losses.
 
     1. The first of `OPTIONS` whose loss is negligible.
     2. Otherwise consider the options that are certainly better than training on ideal forces, by
@@ -102,8 +101,8 @@ class Advice(NamedTuple):
 
     task: str
     """Task name."""
-    delivery: Delivery
-    """Bench measurement."""
+    response: ActuatorResponse
+    """Response of the actuator on the bench."""
     losses: tuple[Loss, ...]
     """Losses of policies trained on ideal forces, by axis; empty if the study has no results."""
     options: Mapping[str, LossBounds]
@@ -115,18 +114,18 @@ class Advice(NamedTuple):
 
     def summary(self) -> dict[str, Any]:
         """Return the fields under the keys of the command line's JSON output."""
-        names = {"delivery": "found"}
+        names = {"response": "found"}
         return {names.get(name, name): value for name, value in self._asdict().items()}
 
 
 def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
     """Recommend an option for a force-controlled actuator on a task from the study's results."""
-    delivery = measure_on_task(actuator, task)
-    losses = predict_losses(evidence, task, severities(delivery, task))
+    response = measure_on_task(actuator, task)
+    losses = predict_losses(evidence, task, severities(response, task))
     if len(losses) < len(AXES):
         return Advice(
             task,
-            delivery,
+            response,
             (),
             {},
             None,
@@ -134,9 +133,9 @@ def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
         )
     redesigned, boosted = (
         redesign_loop(actuator, task),
-        with_larger_command(actuator, task, delivery),
+        measure_with_larger_command(actuator, task, response),
     )
-    options = option_bounds(evidence, task, severities(delivery, task))
+    options = option_bounds(evidence, task, severities(response, task))
     for name, improved in (
         (LOOP, None if redesigned is None else measure_on_task(redesigned, task)),
         (COMMAND, boosted),
@@ -147,16 +146,16 @@ def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
             )
     # The study has no axis for excess force or for an offset, so that it predicts no loss for them.
     untested = ""
-    if max(delivery.at_rest, delivery.at_speed) > 1.0 + MARGIN:
+    if max(response.at_rest, response.at_speed) > 1.0 + MARGIN:
         untested = "it delivers more force than commanded"
     # The mean of correlated noise samples stays below half their standard deviation, so that noise
     # alone does not count as an offset.
-    if delivery.unasked > max(0.02, delivery.noise / 2.0):
-        untested = f"it delivers {delivery.unasked:.2g} of the largest force at a command of zero"
+    if response.unasked > max(0.02, response.noise / 2.0):
+        untested = f"it delivers {response.unasked:.2g} of the largest force at a command of zero"
     if untested:
-        return Advice(task, delivery, losses, options, MEASURE, f"{untested}, which was not tested")
+        return Advice(task, response, losses, options, MEASURE, f"{untested}, which was not tested")
     verdict = decide(options)
-    return Advice(task, delivery, losses, options, verdict, _reason(verdict, options, delivery))
+    return Advice(task, response, losses, options, verdict, _reason(verdict, options, response))
 
 
 def predict_losses(
@@ -171,11 +170,13 @@ def predict_losses(
 
 
 def _bounds_of_losses(losses: Sequence[Loss]) -> LossBounds:
+    """Return the sum of losses; it has no upper bound if a severity exceeds all tested ones."""
     outcome = sum_outcomes(loss.outcome for loss in losses)
     return LossBounds(None if any(loss.beyond for loss in losses) else outcome, outcome)
 
 
 TestedPoints = Mapping[str, Sequence[tuple[Mapping[str, float], Outcome]]]
+"""Option -> tests, each as (axis -> severity, loss)."""
 
 
 def option_bounds(
@@ -225,7 +226,7 @@ def option_bounds(
 
 
 def tested_points(evidence: Evidence, task: str) -> TestedPoints:
-    """Return tested severities and losses of policies that were not trained on ideal forces."""
+    """Return option -> (tested severities, loss) of policies not trained on ideal forces."""
     all_tests = [
         (f"{axis} {severity:g}", {axis: severity})
         for axis, definition in AXES.items()
@@ -264,7 +265,8 @@ def tested_points(evidence: Evidence, task: str) -> TestedPoints:
 # -- text ------------------------------------------------------------------------------------------
 
 
-def _reason(verdict: str, options: Mapping[str, LossBounds], delivery: Delivery) -> str:
+def _reason(verdict: str, options: Mapping[str, LossBounds], response: ActuatorResponse) -> str:
+    """Return the reason for a verdict as text."""
     ideal_trained = options[IDEAL]
     text = f"policies trained on ideal forces lose {describe(ideal_trained)}"
     if verdict in (IDEAL, BUY):
@@ -284,7 +286,7 @@ def _reason(verdict: str, options: Mapping[str, LossBounds], delivery: Delivery)
             f"{text}; {' and '.join(untested) or 'any other option'} was not tested at this"
             " severity on this task"
         )
-    factor = f" by {1.0 / delivery.at_rest:.2f}" if verdict == COMMAND else ""
+    factor = f" by {1.0 / response.at_rest:.2f}" if verdict == COMMAND else ""
     chosen = options[verdict]
     caveat = (
         ""
@@ -301,13 +303,13 @@ def describe(option: LossBounds) -> str:
         return "an unknown share"
     mean, low, high = outcome.loss
     failed = f"{round(outcome.failed * len(outcome.lost))} of {len(outcome.lost)} fail"
-    return f"{option.bound}{mean:z.2f} of the span ({low:z.2f} to {high:z.2f}; {failed})"
+    return f"{option.prefix}{mean:z.2f} of the span ({low:z.2f} to {high:z.2f}; {failed})"
 
 
 # -- measured --------------------------------------------------------------------------------------
 
 RANDOM_EPISODES = 100
-"""Episodes of random actions that give the span's lower end for a task outside the study."""
+"""Episodes of random actions whose mean return is the span's lower end, outside the study."""
 
 
 class Measurement(NamedTuple):
@@ -320,20 +322,20 @@ class Measurement(NamedTuple):
     options: Mapping[str, Trial]
     """Option -> test of its policies, on the actuator or on the same motor with a designed loop."""
 
-    def loss_bounds(self, collected: Collected) -> dict[str, LossBounds]:
+    def loss_bounds(self, collected: StudyResults) -> dict[str, LossBounds]:
         """Return the loss by option, for `decide`; the task's span is treated as exact.
 
         Raises:
             ValueError: a result is missing, or the baseline is no better than random actions.
         """
         if collected.missing:
-            why = next((f": {name}: {error}" for name, error in collected.failures.items()), "")
+            reason = next((f": {name}: {error}" for name, error in collected.failures.items()), "")
             raise ValueError(
-                f"{len(collected.missing)} of its trainings and tests are missing{why}: run it"
-                " again"
+                f"{len(collected.missing)} of the measurement's trainings and tests are"
+                f" missing{reason}: run it again"
             )
         env = self.baseline.env
-        floor = FLOORS.get(env.task) if self.baseline.arm == _ideal_arm(env.task) else None
+        floor = FLOORS.get(env.task) if self.baseline.arm == _baseline_arm(env.task) else None
         if floor is None:
             floor = evaluate(RandomPolicy(env.action_space), env, RANDOM_EPISODES).returns.mean
         scores, succeeded = (
@@ -369,14 +371,14 @@ def plan_measurement(
         seeds: number of training runs for each option, at least 2.
         root: folder of the run folders.
         episodes: test episodes of each policy.
-        trust: whether to import the modules that a run folder names, which executes them.
+        trust: True to import, and thereby execute, the modules that a run folder names.
 
     Raises:
         ValueError: fewer than 2 seeds, or the actuator is ideal.
     """
     if seeds < 2:
         raise ValueError(f"seeds = {seeds}: an interval needs at least 2")
-    base = _ideal_arm(subject, trust)
+    base = _baseline_arm(subject, trust)
     # The ideal environment is reused unchanged, so that policies are judged by their own reward.
     ideal_env = base.config.env
     env_on_actuator = dataclasses.replace(ideal_env, actuator=actuator)
@@ -396,7 +398,7 @@ def plan_measurement(
             options[LOOP] = Trial(
                 base, "designed", dataclasses.replace(ideal_env, actuator=redesigned)
             )
-        options[RANDOMIZE] = Trial(generic(base), "it", env_on_actuator)
+        options[RANDOMIZE] = Trial(generic_arm(base), "it", env_on_actuator)
     options[THROUGH] = Trial(through_arm, "it", env_on_actuator)
     baseline = Trial(base, "ideal", ideal_env)
     return Measurement(
@@ -406,10 +408,10 @@ def plan_measurement(
     )
 
 
-def _ideal_arm(subject: str, trust: bool = False) -> Arm:
-    """Return the arm trained on ideal forces: the study's, a run's or the source's default."""
+def _baseline_arm(subject: str, trust: bool = False) -> Arm:
+    """Return the arm trained on ideal forces: of the study, of a run, or of a default agent."""
     if subject in SECONDS:
-        return ideal(subject)
+        return ideal_arm(subject)
     if (Path(subject) / "config.json").is_file():
         config = load_config(Path(subject), trust)
     else:
@@ -426,5 +428,6 @@ def _ideal_arm(subject: str, trust: bool = False) -> Arm:
     return Arm(f"{config.task}: ideal", config, 60.0)
 
 
-def _values(collected: Collected, trial: Trial, measure: str) -> np.ndarray:
+def _values(collected: StudyResults, trial: Trial, measure: str) -> np.ndarray:
+    """Return a measure of all policies of a trial as an array."""
     return np.array(list(collected.scores(trial, measure).values()))

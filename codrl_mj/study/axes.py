@@ -83,7 +83,7 @@ def lag(task: str, severity: float) -> EnvConfig:
 
 
 def weakness(task: str, severity: float) -> EnvConfig:
-    """Return the task with forces reduced by a share."""
+    """Return the task with a weaker actuator; the severity is the missing share of the force."""
     return study_env(task, Lag(0.0, gain=1.0 - severity))
 
 
@@ -95,7 +95,7 @@ def delay(task: str, severity: float) -> EnvConfig:
 
 
 def friction(task: str, severity: float) -> EnvConfig:
-    """Return the task with Coulomb friction in the actuated joint [largest force]."""
+    """Return the task with Coulomb friction in the joint, as a share of the largest force."""
     return study_env(task, joint=Joint(friction=severity * find_task(task).max_force))
 
 
@@ -109,7 +109,7 @@ def motor_constant(task: str) -> float:
 
 
 def needed_voltage(task: str) -> float:
-    """Return the voltage [V] of a motor with `motor_constant`, at F and w: 2*sqrt(F*w)."""
+    """Return the voltage [V] that a motor with `motor_constant` needs at F and w: 2*sqrt(F*w)."""
     return 2.0 * math.sqrt(find_task(task).max_force * REFERENCE_SPEEDS[task])
 
 
@@ -122,13 +122,14 @@ def drive_on_supply(task: str, volts: float) -> Drive:
 
 
 def supply(task: str, severity: float) -> EnvConfig:
-    """Return the task with a drive whose supply lacks a share of the needed voltage."""
+    """Return the task with a drive on a low supply; the severity is the missing voltage share."""
     return study_env(task, drive_on_supply(task, (1.0 - severity) * needed_voltage(task)))
 
 
 def noise(task: str, severity: float) -> EnvConfig:
-    """Return the task with a noisy current sensor; the severity is its deviation [largest current].
+    """Return the task with a noisy current sensor.
 
+    The severity is the standard deviation of the noise, as a share of the largest current.
     The winding's time constant is ten integration steps and the loop halves the error in one step,
     so half of each noise sample becomes torque.
     """
@@ -180,11 +181,11 @@ class Axis:
     severities: tuple[float, ...]
     """Six tested severities; the first is 0."""
     training_severity: Mapping[str, float]
-    """Task -> severity used in training, chosen in a pilot or by the plan's rule."""
+    """Task -> severity in training, chosen in a pilot study or by the rule of the study's plan."""
     make_env: Callable[[str, float], EnvConfig]
     """Function (task, severity) -> environment."""
     motor_at_zero: bool = False
-    """True if severity 0 is a motor without the effect, not ideal forces."""
+    """True if the test at severity 0 has a motor without the effect, instead of ideal forces."""
 
 
 AXES: Mapping[str, Axis] = {
@@ -236,8 +237,8 @@ AXES: Mapping[str, Axis] = {
 """The axes by name."""
 
 
-def arm(task: str, name: str, env: EnvConfig) -> Arm:
-    """Return the arm of a task's agent in an environment, with default settings."""
+def make_arm(task: str, name: str, env: EnvConfig) -> Arm:
+    """Return the arm that trains a task's agent, with default settings, in an environment."""
     agent = "sarsa" if task == "mountain_car" else "ppo"
     changes: dict[str, Any] = {"total_steps": BUDGETS[task]} if task in BUDGETS else {}
     base = TrainConfig.preset(task, agent, **changes)
@@ -250,15 +251,15 @@ def arm(task: str, name: str, env: EnvConfig) -> Arm:
 
 
 @functools.cache
-def ideal(task: str) -> Arm:
+def ideal_arm(task: str) -> Arm:
     """Return the arm trained on ideal forces."""
-    return arm(task, "ideal", study_env(task))
+    return make_arm(task, "ideal", study_env(task))
 
 
-def generic(base: Arm) -> Arm:
-    """Return the arm trained with generic randomization: strength, lag, delay and random pushes.
+def generic_arm(base: Arm) -> Arm:
+    """Return the arm trained with generic randomization: of strength, lag, delay and pushes.
 
-    This is the common practice without a model of the motor.
+    This is common practice where no model of the motor is available.
 
     Args:
         base: arm of a built-in task on ideal forces; all other settings are kept.

@@ -56,12 +56,12 @@ def make_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., 
     return run
 
 
-class Delivery(NamedTuple):
-    """Response of an actuator to a command within `HORIZON_STEPS`.
+class ActuatorResponse(NamedTuple):
+    """Response of an actuator to a step of the command, measured for `HORIZON_STEPS`.
 
-    Times are in policy steps, forces in shares of the task's largest force. A loop that rises fast
-    and then creeps to its final value counts as fast and weak, because a policy changes its command
-    long before that value is reached.
+    Times are in policy steps, forces in shares of the task's largest force. Final values are those
+    at the end of the measurement: a loop that rises fast and then creeps on counts as fast and
+    weak, because a policy changes its command long before the loop settles.
     """
 
     dead_time: float
@@ -72,23 +72,23 @@ class Delivery(NamedTuple):
     section 2.4 (area methods).
     """
     at_rest: float
-    """Final force with the joint blocked [largest force]."""
+    """Final force at standstill (blocked joint) [largest force]."""
     at_speed: float
-    """Final force while driving at the reference speed [largest force]."""
+    """Final force at the reference speed [largest force]."""
     friction: float
-    """Braking force at zero command [largest force]. It is the larger of two values: the total
-    braking force at a twentieth of the reference speed, and the mechanical losses, without the
-    back-EMF, at the reference speed.
+    """Braking force at zero command [largest force]: the total braking force at a twentieth of
+    the reference speed or, if larger, the mechanical losses alone (without the effect of the
+    back-EMF) at the reference speed.
     """
     noise: float
     """Standard deviation of the force [largest force] over the integration steps."""
     unasked: float
-    """Magnitude of the mean force at rest and zero command [largest force]."""
+    """Magnitude of the mean force at standstill and zero command [largest force]."""
 
 
-def measure_delivery(
+def measure_response(
     actuator: Any, timestep: float, step: float, force: float, speed: float
-) -> Delivery:
+) -> ActuatorResponse:
     """Measure the response of an actuator to a command.
 
     Args:
@@ -126,7 +126,7 @@ def measure_delivery(
     dead = int(started[0]) if len(started) else 0
     lag = max(float(np.sum(np.abs(1.0 - torques / last))) - dead, 0.0) if last else 0.0
     settled = unasked[len(unasked) // 2 :] / force
-    return Delivery(
+    return ActuatorResponse(
         dead_time=dead * timestep / step,
         lag=lag * timestep / step,
         at_rest=last,
@@ -145,7 +145,7 @@ def _end(rows: np.ndarray) -> np.ndarray:
 # -- on a task of the study ------------------------------------------------------------------------
 
 
-def measure_on_task(actuator: Any, task: str, share: float = 1.0) -> Delivery:
+def measure_on_task(actuator: Any, task: str, share: float = 1.0) -> ActuatorResponse:
     """Measure the response of an actuator to a `share` of the largest force of a task."""
     check_selection("task", [task], REFERENCE_SPEEDS)
     if actuator.MOTION:
@@ -154,7 +154,7 @@ def measure_on_task(actuator: Any, task: str, share: float = 1.0) -> Delivery:
             " actuator of another family"
         )
     definition = find_task(task)
-    return measure_delivery(
+    return measure_response(
         actuator,
         timestep(task),
         definition.step_duration,
@@ -163,14 +163,14 @@ def measure_on_task(actuator: Any, task: str, share: float = 1.0) -> Delivery:
     )
 
 
-def severities(delivery: Delivery, task: str) -> dict[str, float]:
-    """Return the severity on each axis that corresponds to the measured actuator.
+def severities(response: ActuatorResponse, task: str) -> dict[str, float]:
+    """Return the severity on each axis that corresponds to a measured response.
 
-    A gain g (weakness 1 - g) and a supply that lacks a share d leave g*min(1, 2*(1 - d)) of the
-    largest force at rest and g*(1 - 2*d) at the reference speed (`axes.supply`). Both equations are
-    solved for g <= 1 and d.
+    With a gain g (weakness 1 - g) and a supply that lacks a share d of the needed voltage, the
+    force is g*min(1, 2*(1 - d)) at standstill and g*(1 - 2*d) at the reference speed
+    (`axes.supply`), in shares of the largest force. Both equations are solved for g <= 1 and d.
     """
-    rest, speed = max(delivery.at_rest, 0.0), min(delivery.at_speed, delivery.at_rest)
+    rest, speed = max(response.at_rest, 0.0), min(response.at_speed, response.at_rest)
     strength = rest if speed >= 0.0 else rest - speed
     if rest == 0.0:
         missing = 1.0
@@ -179,27 +179,29 @@ def severities(delivery: Delivery, task: str) -> dict[str, float]:
     else:
         missing = 1.0 - rest / (2.0 * strength)
     noise_severity = (
-        delivery.noise and delivery.noise / measure_on_task(noise(task, 1.0).actuator, task).noise
+        response.noise and response.noise / measure_on_task(noise(task, 1.0).actuator, task).noise
     )
     return {
-        "lag": delivery.lag,
+        "lag": response.lag,
         "weakness": max(1.0 - strength, 0.0),
         "supply": missing,
-        "delay": delivery.dead_time,
-        "friction": delivery.friction,
+        "delay": response.dead_time,
+        "friction": response.friction,
         "noise": noise_severity,
     }
 
 
-def with_larger_command(actuator: Any, task: str, delivery: Delivery) -> Delivery | None:
-    """Return the response to commands that are scaled up by the force lost at rest.
+def measure_with_larger_command(
+    actuator: Any, task: str, response: ActuatorResponse
+) -> ActuatorResponse | None:
+    """Return the response to commands that are scaled up to compensate for the force lost at rest.
 
-    None if at most 2 % or at least 90 % of the force is lost, or if the loop can be redesigned:
-    then the missing force comes late and is not lost.
+    The result is None if at most 2 % or at least 90 % of the force is lost, and if the loop can be
+    redesigned: its force is then late rather than lost.
     """
-    if not 0.1 < delivery.at_rest < 0.98 or redesign_loop(actuator, task) is not None:
+    if not 0.1 < response.at_rest < 0.98 or redesign_loop(actuator, task) is not None:
         return None
-    factor = 1.0 / delivery.at_rest
+    factor = 1.0 / response.at_rest
     boosted = measure_on_task(actuator, task, factor)
     shares = {name: min(getattr(boosted, name) * factor, 1.0) for name in ("at_rest", "at_speed")}
     scaled = {name: getattr(boosted, name) * factor for name in ("friction", "noise", "unasked")}
@@ -207,9 +209,9 @@ def with_larger_command(actuator: Any, task: str, delivery: Delivery) -> Deliver
 
 
 def redesign_loop(actuator: Any, task: str) -> Drive | None:
-    """Return the same motor and supply with a designed loop; None if that changes nothing."""
+    """Return the motor and supply with a designed loop; None if a new design would not help."""
     if isinstance(actuator, DCMotorActuator):
-        # No design of the loop corrects an error of the current sensor.
+        # No loop can correct an error of its current sensor.
         sensor_error = actuator.controller.current_noise or actuator.controller.current_bias
         return None if sensor_error else drive_with_designed_loop(actuator, task)
     if isinstance(actuator, Drive):

@@ -30,7 +30,7 @@ class Outcome(NamedTuple):
     lost: np.ndarray
     """Lost share of the task's span, shape (policies,)."""
     missed: np.ndarray
-    """Lost share of successful episodes, shape (policies,); 0 if the task has no success."""
+    """Lost share of successful episodes, shape (policies,); 0 if the task defines no success."""
 
     @property
     def loss(self) -> Interval:
@@ -64,7 +64,7 @@ class Outcome(NamedTuple):
 
     @property
     def is_harmful(self) -> bool:
-        """True if a 95 % interval lies above `FAILURE_MARGIN` or above a tenth of the success."""
+        """True if the loss certainly exceeds `FAILURE_MARGIN`, or lost success a tenth (95 %)."""
         return self.loss.low > FAILURE_MARGIN or self.success_lost.low > MAX_FAILED_SHARE
 
     def summary(self) -> dict[str, Any]:
@@ -80,7 +80,7 @@ class Outcome(NamedTuple):
 
 
 def sum_outcomes(outcomes: Iterable[Outcome]) -> Outcome:
-    """Add losses policy by policy, as if their causes were independent; the sum is at most 1."""
+    """Add losses policy by policy, as if their causes did not interact; the sum is at most 1."""
     terms = list(outcomes)
     count = min(len(outcome.lost) for outcome in terms)
     lost, missed = (sum(part[:count] for part in parts) for parts in zip(*terms, strict=True))
@@ -127,7 +127,7 @@ class Evidence:
 
     @classmethod
     def read(cls, *files: Path) -> "Evidence":
-        """Read files of rows; without arguments, the published rows of checkout or wheel."""
+        """Read files of rows; by default the published rows, from the checkout or the wheel."""
         published = [
             path
             for folder in EVIDENCE
@@ -157,7 +157,7 @@ class Evidence:
         return cls(rows)
 
     def without(self, *tested: str) -> "Evidence":
-        """Return a copy without some tests, such as `lag 2` or `marginal motor`."""
+        """Return a copy without the named tests, such as `lag 2` or `marginal motor`."""
         return Evidence(row for row in self.rows if row["tested"] not in tested)
 
     def outcome(
@@ -169,8 +169,8 @@ class Evidence:
             task: task name.
             trained: name of the arm, without the task.
             tested: name of the test.
-            paired_test: test in which the same policies are the reference; None takes the mean of
-                the policies that were trained and tested on ideal forces.
+            paired_test: test whose scores of the same policies are the reference; None takes the
+                mean score of the policies that were trained and tested on ideal forces.
         """
         scores, ideal_scores = (
             self._tested.get((task, trained, tested), {}),
@@ -242,5 +242,6 @@ class Evidence:
 
 
 def _interval(values: Sequence[float] | np.ndarray) -> Interval:
+    """Return the mean with its 95 % interval by Student's t."""
     sample = np.asarray(values, dtype=float)
     return effect([Stratum(sample, np.zeros_like(sample), paired=True)])

@@ -17,7 +17,7 @@ from typing import Any
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import did_you_mean
 from codrl_mj.runs.files import read_json, write_json
-from codrl_mj.study.parallel import Workers, compute
+from codrl_mj.study.parallel import Workers, call_in_parallel
 from codrl_mj.training import (
     RunInUseError,
     TrainConfig,
@@ -33,13 +33,13 @@ _LOCK_TIMEOUT = 120.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Deployment:
-    """Test of a run's last policy on an actuator."""
+class PolicyTest:
+    """Test of a run's last policy in another environment, usually with another actuator."""
 
     run: Path
     """Finished run folder."""
     env: EnvConfig
-    """Environment of the test, except actions and observations, which are those of the training."""
+    """Environment of the test, but with the actions and observations of the training."""
     episodes: int = 100
     """Number of episodes."""
     seed: int = 0
@@ -66,19 +66,19 @@ def check_selection(field: str, names: Sequence[str], known: Iterable[str]) -> N
 
 
 def cell_folder(root: Path, config: TrainConfig) -> Path:
-    """Return the run folder of a configuration; its name ends with a digest of it."""
+    """Return the run folder of a configuration; its name ends with the configuration's digest."""
     return root / f"{config.task}-{config.agent.name}-s{config.seed}-{_digest(config.as_mapping())}"
 
 
-def read_failure(cell: Path | Deployment) -> str | None:
+def read_failure(cell: Path | PolicyTest) -> str | None:
     """Return the error of the last attempt of a cell (run folder or test), in one line, or None."""
     record = failure_record(cell)
     return str(read_json(record, "record of a failure")["error"]) if record.is_file() else None
 
 
-def failure_record(cell: Path | Deployment) -> Path:
+def failure_record(cell: Path | PolicyTest) -> Path:
     """Return the JSON file of a cell's failure: error, traceback and configuration."""
-    if isinstance(cell, Deployment):
+    if isinstance(cell, PolicyTest):
         return cell.run.parent / _FAILURES / f"{cell.run.name}-{cell.record.stem}.json"
     return cell.parent / _FAILURES / f"{cell.name}.json"
 
@@ -94,8 +94,8 @@ def train_runs(
     Args:
         runs: run folder -> configuration.
         workers: settings of the worker processes.
-        on_run: called with a folder when its training has finished or failed; runs that were
-            finished before come first.
+        on_run: called with a folder when its training has finished or failed, and first with each
+            run that was already finished.
         **options: further arguments of `training.train`.
 
     Returns:
@@ -109,25 +109,25 @@ def train_runs(
     return _compute(runs, work, workers, on_run)
 
 
-def deploy_cells(
-    deployments: Mapping[str, Deployment],
+def run_tests(
+    policy_tests: Mapping[str, PolicyTest],
     workers: Workers = Workers(),  # noqa: B008 - frozen
     on_cell: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Run every test that has no record yet; a record is an `Evaluation.as_mapping()`.
+    """Run every test that has no record yet, and write its record, an `Evaluation.as_mapping()`.
 
     Args:
-        deployments: name of the test -> test.
+        policy_tests: name of the test -> test.
         workers: settings of the worker processes.
-        on_cell: called with a name when its test has finished or failed; tests that were finished
-            before come first.
+        on_cell: called with a name when its test has finished or failed, and first with each test
+            that was already finished.
     """
     work = {
-        name: (test, {"test": name, "run": test.run.name}, _deploy, test)
-        for name, test in deployments.items()
+        name: (test, {"test": name, "run": test.run.name}, _run_test, test)
+        for name, test in policy_tests.items()
         if not test.record.is_file()
     }
-    _compute(deployments, work, workers, on_cell)
+    _compute(policy_tests, work, workers, on_cell)
 
 
 def _compute(
@@ -141,7 +141,7 @@ def _compute(
         if cell not in work:
             on_cell(cell)
     failures = {}
-    for cell, failure in compute(
+    for cell, failure in call_in_parallel(
         _attempt, ((cell, *arguments) for cell, arguments in work.items()), workers
     ):
         if failure is not None:
@@ -152,12 +152,12 @@ def _compute(
 
 def _attempt(
     name: Any,
-    cell: Path | Deployment,
+    cell: Path | PolicyTest,
     context: Mapping[str, Any],
     function: Callable[..., None],
     *arguments: Any,
 ) -> tuple[Any, str | None]:
-    """Call a function; return the name and the error in one line, which is also recorded."""
+    """Call a function, and record its error; return the name and the error in one line, or None."""
     record = failure_record(cell)
     try:
         function(*arguments)
@@ -187,7 +187,7 @@ def _train(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> Non
             time.sleep(1.0)
 
 
-def _deploy(test: Deployment) -> None:
+def _run_test(test: PolicyTest) -> None:
     """Evaluate one policy."""
     from codrl_mj.evaluation import evaluate
     from codrl_mj.runs.policies import load_policy
@@ -200,5 +200,6 @@ def _deploy(test: Deployment) -> None:
 
 
 def _digest(content: Any) -> str:
+    """Return a short digest of JSON-serializable content."""
     text = json.dumps(content, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -1,8 +1,8 @@
 """Statistical inference on scores of training runs: tests, corrections, equivalence and power.
 
 A score is the mean of one trained policy over its test episodes. The independent samples are runs,
-not episodes. A contrast pools strata (the same question on several tasks or severities): its effect
-is the mean of the strata's differences of means.
+not episodes. A contrast pools strata, which ask the same question on several tasks or at several
+severities. Its effect is the mean, over strata, of the difference of the two groups' means.
 """
 
 import bisect
@@ -107,7 +107,9 @@ def _random_labels(n: int, m: int, stratum: int) -> np.ndarray:
 
 
 def equivalence_p(strata: Sequence[Stratum], margin: float) -> float:
-    """Return the p-value of a difference of at least the margin, from two one-sided tests.
+    """Return the p-value for the hypothesis that the difference reaches the margin (TOST).
+
+    It is the larger p-value of two one-sided permutation tests; a small one shows equivalence.
 
     Args:
         strata: at least one.

@@ -45,7 +45,7 @@ def read_conclusions(page: Path) -> str:
     if file.is_file():
         return file.read_text(encoding="utf-8").strip() + "\n"
     return (
-        f"No conclusions are written yet: they belong into `{file.name}` beside this page, which"
+        f"No conclusions are written yet: they belong in `{file.name}` beside this page, which"
         " includes them.\n"
     )
 

@@ -49,12 +49,12 @@ class Workers(Checked):
         return (os.cpu_count() or 1) if self.jobs == -1 else self.jobs
 
 
-def compute(
+def call_in_parallel(
     function: Callable[..., Any], work: Iterable[tuple[Any, ...]], workers: Workers
 ) -> Iterator[Any]:
     """Yield the results of calls as they complete; with Ray, after all of them have finished.
 
-    After Ctrl-C no further call starts, trainings write their checkpoints, and other calls run to
+    After Ctrl-C no further call starts, trainings stop at a checkpoint, and other calls run to
     their end; a second Ctrl-C stops at once. An exception in a call aborts the others. The worker
     processes end with this process, even if it is killed.
 
@@ -64,7 +64,7 @@ def compute(
         workers: settings of the worker processes.
 
     Raises:
-        TrainingStoppedError: a signal asked to stop.
+        TrainingStoppedError: a signal requested a stop.
     """
     calls = list(work)
     if not calls:
@@ -98,7 +98,7 @@ def compute(
                 stop_signals.append(stopped_by)
         if stop_signals:
             raise TrainingStoppedError(
-                "stopped: the same command goes on from the last checkpoints", stop_signals[0]
+                "stopped: the same command continues from the last checkpoints", stop_signals[0]
             )
 
 

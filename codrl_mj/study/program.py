@@ -30,7 +30,7 @@ class Program(Checked, abc.ABC):
     """Script that computes the missing trainings and tests of a study and writes its page.
 
     Raises:
-        ValueError: a number that is out of its bounds.
+        ValueError: a number is out of bounds.
     """
 
     root: Path
@@ -43,7 +43,7 @@ class Program(Checked, abc.ABC):
     accept_changes: bool = False
     """Continue started trainings even if the code or a package has changed since."""
     dry_run: bool = False
-    """Only list the trainings, the finished ones, and the estimated time of the rest."""
+    """Only list the finished and the missing trainings, with the estimated time of the latter."""
     only_page: bool = False
     """Only write the page from the available results."""
 
@@ -59,7 +59,8 @@ class Program(Checked, abc.ABC):
     def publish(self) -> None:
         """Write the available results after each completed seed; run folders may be temporary.
 
-        An error is only printed: the page is written again at the end, and raises it there.
+        An error is only printed here; at the end of the study, where the page is written again, it
+        is raised.
         """
         try:
             self.write()
@@ -79,7 +80,7 @@ class Program(Checked, abc.ABC):
         check_writable(self.root)
         check_writable(self.out)
         if not self.only_page:
-            # A missing package is reported before hours of work, not after.
+            # The pages need matplotlib: report that it is missing before hours of work, not after.
             import matplotlib  # noqa: F401
 
             compute(grid, workers, self.accept_changes, self.publish)
@@ -118,7 +119,7 @@ def compute(
     on_seed: Callable[[], None] = lambda: None,
 ) -> None:
     """Compute the missing cells of a grid, with progress bars for trainings and tests."""
-    counts = {"training": len(grid.cells), "test": len(grid.deployments)}
+    counts = {"training": len(grid.cells), "test": len(grid.policy_tests)}
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

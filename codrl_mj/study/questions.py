@@ -20,7 +20,7 @@ from codrl_mj.study.inference import (
     permutation_p,
     runs_needed,
 )
-from codrl_mj.study.trials import Collected, Trial
+from codrl_mj.study.trials import StudyResults, Trial
 
 MARGIN = 0.05
 """Largest difference that counts as negligible [share of the task's span]."""
@@ -71,7 +71,7 @@ class Scores:
     """
 
     def __init__(
-        self, collected: Collected, floors: Mapping[str, float], ideal_trials: Iterable[Trial]
+        self, collected: StudyResults, floors: Mapping[str, float], ideal_trials: Iterable[Trial]
     ) -> None:
         """Compute the span of each task.
 
@@ -99,10 +99,10 @@ class Scores:
         }
 
     def stratum(self, contrasts: Sequence[Contrast]) -> Stratum | None:
-        """Return each seed's mean over contrasts of one task; None with fewer than two per group.
+        """Return the scores of one task's contrasts, averaged by seed; None with < 2 seeds.
 
-        Contrasts may share policies, so their scores are not independent; seeds are. Therefore each
-        seed contributes one mean, over all contrasts, and only if it was tested in all of them.
+        Contrasts may share policies, so that only different seeds are independent. Therefore each
+        seed contributes one mean over all contrasts, and only if it was tested in all of them.
         """
         paired = all(contrast.paired for contrast in contrasts)
         sides = [
@@ -127,19 +127,21 @@ class Verdict(NamedTuple):
     question: Question
     """The question."""
     runs: tuple[int, int]
-    """Smallest number of treatment and of control policies among the contrasts."""
+    """Number of treatment and of control policies, each the smallest among the tasks."""
     strata: tuple[int, int]
-    """Number of testable contrasts, and of all contrasts."""
+    """Number of contrasts with results, and of all contrasts."""
     effect: Interval
     """Mean difference of scores [share of the span], with interval; NaN without contrasts."""
     p: float
-    """Uncorrected p-value of no difference (`equivalent`: of the margin); NaN if not judged."""
+    """p-value before correction: for no difference or, if `equivalent`, for a difference of at
+    least the margin; NaN if not judged.
+    """
     corrected_p: float
     """p-value after correction for all questions that are judged together."""
 
     @property
     def outcome(self) -> Literal["yes", "no", "the other way", "open", "not judged"]:
-        """Answer; `no` only for `equivalent`, if the interval lies beyond the margin."""
+        """Answer; `no` only for `equivalent`, if the whole interval lies beyond the margin."""
         if np.isnan(self.p):
             return "not judged"
         if self.corrected_p < LEVEL:
@@ -158,7 +160,8 @@ class Verdict(NamedTuple):
         distance from the margin in one of the two one-sided tests.
 
         Args:
-            questions: number of questions that Holm corrects together; the strictest level is used.
+            questions: number of questions that Holm corrects together; the level is that of the
+                smallest p-value.
         """
         from scipy.stats import t
 

@@ -2,8 +2,8 @@
 
 A study is defined by its trials. Every training is a run folder named by its configuration, and
 every test is a file in it, so available results are never computed twice. Run folders may be
-temporary: a row of every test, with the name of its run, is published and replaces a run folder
-that is no longer available.
+temporary: a published table has a row for every test, with the name of its run, and replaces run
+folders that are no longer available.
 """
 
 import collections
@@ -19,7 +19,7 @@ from codrl_mj.actuators import mapping_of
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.measures import bootstrap_mean
 from codrl_mj.runs.files import read_json
-from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, read_failure, train_runs
+from codrl_mj.study.grid import PolicyTest, cell_folder, read_failure, run_tests, train_runs
 from codrl_mj.study.pages import read_csv
 from codrl_mj.study.parallel import Workers
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, finished
@@ -28,7 +28,7 @@ from codrl_mj.training.folder import RESULT
 TEST_SECONDS = 1.0
 """Approximate time of a test [s of one core]."""
 FAILURE_MARGIN = 0.1
-"""Smallest deficit of a score below 1 with which a policy counts as failed."""
+"""A policy counts as failed if its score is lower than 1 by more than this margin."""
 RUNS, TOTALS = "runs.csv", "totals.json"
 """Published files of a study: a row for every policy and test; totals of its trainings."""
 MEASURES = (
@@ -55,7 +55,7 @@ class Arm:
     config: TrainConfig
     """Training with seed 0; the others differ only in the seed."""
     seconds: float
-    """Estimated time of a training [s of one core]; replaced by the mean of finished ones."""
+    """Estimated time of a training [s of one core], used until a training has finished."""
 
     @property
     def task(self) -> str:
@@ -76,7 +76,7 @@ class Trial:
     test: str
     """Name of the test, unique within the task."""
     env: EnvConfig
-    """Environment of the test, except actions and observations, which are those of the training."""
+    """Environment of the test, but with the actions and observations of the training."""
 
     @property
     def name(self) -> str:
@@ -149,7 +149,7 @@ class Grid:
             ]
             if duplicates:
                 raise ValueError(
-                    f"{kind} {duplicates[0]!r}: names several: give each a different name"
+                    f"{kind} {duplicates[0]!r}: is the name of several: give each a different name"
                 )
 
     @functools.cached_property
@@ -160,8 +160,8 @@ class Grid:
     @functools.cached_property
     def cells(self) -> dict[tuple[str, int], TrainConfig]:
         """Trainings by arm and seed, sorted by seed and then by descending time."""
-        # Low seeds first: an interrupted study then has results of every arm. Long trainings first
-        # within a seed: the workers finish at about the same time.
+        # Low seeds come first, so that an interrupted study has results of every arm. Within a seed
+        # long trainings come first, so that all workers finish at about the same time.
         all_cells = [(arm, seed) for arm in self.arms for seed in self.seeds_of(arm)]
         all_cells.sort(key=lambda cell: (cell[1], -cell[0].seconds))
         return {(arm.name, seed): arm.training(seed) for arm, seed in all_cells}
@@ -172,11 +172,11 @@ class Grid:
         return {cell: cell_folder(self.root, config) for cell, config in self.cells.items()}
 
     @functools.cached_property
-    def deployments(self) -> dict[tuple[str, int], Deployment]:
+    def policy_tests(self) -> dict[tuple[str, int], PolicyTest]:
         """Tests by trial and seed, including those of policies that are not trained yet."""
         folders = self.folders
         return {
-            (trial.name, seed): Deployment(
+            (trial.name, seed): PolicyTest(
                 folders[trial.arm.name, seed], trial.env, self.episodes, EVALUATION_SEED
             )
             for trial in self.trials
@@ -185,8 +185,8 @@ class Grid:
 
     @functools.cached_property
     def published_rows(self) -> dict[tuple[str, int], dict[str, float | None]]:
-        """Published measures by trial and seed, of tests whose run has the same configuration."""
-        tests, rows = self.deployments, {}
+        """Published measures by trial and seed, if the run's configuration is still the same."""
+        tests, rows = self.policy_tests, {}
         for row in [] if self.published is None else read_csv(self.published / RUNS):
             key = f"{row['task']}: {row['trained']} on {row['tested']}", int(row["seed"])
             if key in tests and tests[key].run.name == row["run"]:
@@ -195,9 +195,9 @@ class Grid:
                 }
         return rows
 
-    def _untested(self) -> dict[tuple[str, int], Deployment]:
+    def _untested(self) -> dict[tuple[str, int], PolicyTest]:
         """Return the tests that have neither a file nor a published row."""
-        tests = self.deployments
+        tests = self.policy_tests
         return {
             key: test
             for key, test in tests.items()
@@ -222,7 +222,7 @@ class Grid:
 
         Raises:
             ValueError: the backend is Ray, which is not installed.
-            TrainingStoppedError: a signal asked to stop.
+            TrainingStoppedError: a signal requested a stop.
         """
         cells, folders, tests = self.cells, self.folders, self._untested()
         needed = {test.run for test in tests.values()}
@@ -252,19 +252,19 @@ class Grid:
                 for key, test in tests.items()
                 if key[1] in seeds and finished(test.run)
             }
-            deploy_cells(ready, workers, lambda _: on_cell("test"))
+            run_tests(ready, workers, lambda _: on_cell("test"))
             if any(map(finished, unfinished)) or any(
                 test.record.is_file() for test in ready.values()
             ):
                 on_seed()
 
-    def collect(self) -> "Collected":
+    def collect(self) -> "StudyResults":
         """Return the available results, without computing anything.
 
         Raises:
             ValueError: a file of a run is damaged.
         """
-        folders, tests = self.folders, self.deployments
+        folders, tests = self.folders, self.policy_tests
         local_folders = {cell: folder for cell, folder in folders.items() if finished(folder)}
         arm_of = {trial.name: trial.arm.name for trial in self.trials}
         finished_cells = local_folders | {
@@ -275,7 +275,7 @@ class Grid:
         evaluations: dict[str, dict[int, Mapping[str, Any]]] = {
             trial.name: {} for trial in self.trials
         }
-        missing: dict[str, Path | Deployment] = {
+        missing: dict[str, Path | PolicyTest] = {
             cell_name(*cell): folder
             for cell, folder in folders.items()
             if cell not in finished_cells
@@ -288,7 +288,7 @@ class Grid:
             elif finished(test.run):
                 missing[cell_name(trial, seed)] = test
         failures = {name: read_failure(cell) for name, cell in missing.items()}
-        return Collected(
+        return StudyResults(
             grid=self,
             folders={cell: finished_cells[cell] for cell in folders if cell in finished_cells},
             evaluations=evaluations,
@@ -300,9 +300,9 @@ class Grid:
     def _totals(
         self, local_folders: Mapping[tuple[str, int], Path], finished_count: int, missing: int
     ) -> "Totals":
-        """Add the time of newly tested trainings to the published totals."""
+        """Return the published totals, plus those of trainings that are not in them yet."""
         tests, published_totals, file = (
-            self.deployments,
+            self.policy_tests,
             Totals(0, 0, 0.0, {}),
             (self.published or self.root) / TOTALS,
         )
@@ -371,7 +371,7 @@ class Grid:
 
 
 @dataclasses.dataclass(frozen=True)
-class Collected:
+class StudyResults:
     """Available results of a grid."""
 
     grid: Grid
@@ -388,7 +388,7 @@ class Collected:
     """Totals of the trainings."""
 
     def scores(self, trial: Trial, measure: str = "returns") -> dict[int, float]:
-        """Return a measure of a trial's policies by seed, as `to_scalar`.
+        """Return a measure of a trial's policies by seed, as a number; see `to_scalar`.
 
         Policies without a value are left out. A trial outside the grid has no values.
         """
@@ -398,7 +398,7 @@ class Collected:
 
 
 def run_rows(
-    collected: Collected, score: Callable[[Trial], Mapping[int, float]]
+    collected: StudyResults, score: Callable[[Trial], Mapping[int, float]]
 ) -> Iterable[dict[str, Any]]:
     """Yield a row for every policy and test; `score` returns a trial's scores by seed.
 
@@ -420,7 +420,7 @@ def run_rows(
 
 
 def trial_rows(
-    collected: Collected, score: Callable[[Trial], Mapping[int, float]]
+    collected: StudyResults, score: Callable[[Trial], Mapping[int, float]]
 ) -> Iterable[dict[str, Any]]:
     """Yield a row for every trial: mean score with bootstrap interval, means of the measures."""
     for trial in collected.grid.trials:
@@ -457,7 +457,7 @@ def cell_name(name: str, seed: int) -> str:
 
 
 def to_scalar(value: Any) -> Any:
-    """Return a measure as a number: of an interval the mean, of quartiles the median."""
+    """Return a measure as a number: the mean of an interval, or the median of quartiles."""
     return value.get("mean", value.get("median")) if isinstance(value, Mapping) else value
 
 
@@ -467,7 +467,7 @@ def training_seconds(folder: Path) -> float:
 
 
 def format_ranges(numbers: Sequence[int]) -> str:
-    """Return integers as text, with consecutive ones as ranges."""
+    """Return integers as text; consecutive integers are written as ranges, such as `0 to 4`."""
     parts: list[list[int]] = []
     for number in sorted(numbers):
         if parts and number == parts[-1][1] + 1:

@@ -44,7 +44,7 @@ class RunInUseError(RuntimeError):
 
 
 class TrainingStoppedError(Exception):
-    """Error: a signal stopped the training, which can be continued."""
+    """Raised if a signal, such as Ctrl-C, stops a training before its end; it can be resumed."""
 
     def __init__(self, message: str, signal_number: int) -> None:
         """Store the signal's number for the exit status."""

@@ -73,7 +73,7 @@ def train(
     from stable_baselines3.common.logger import Logger
 
     from codrl_mj.envs.sb3 import ActuatedVecEnv
-    from codrl_mj.training.watcher import LearningEnded, Watcher
+    from codrl_mj.training.watcher import TrainingCompleted, Watcher
 
     # Networks of this size run several times slower on two threads.
     torch.set_num_threads(1)
@@ -102,7 +102,7 @@ def train(
                 # The watcher sets its logger when learning begins. Without this line, the default
                 # logger would create a temporary folder before that.
                 model.set_logger(Logger(None, []))
-                with contextlib.suppress(LearningEnded):
+                with contextlib.suppress(TrainingCompleted):
                     model.learn(steps, callback=watcher, log_interval=None)
                 watcher.finish()
     return out

@@ -35,8 +35,8 @@ _RATES = ("learning_rate", "critic_learning_rate", "step_size")
 _CHECKPOINTED = ("marks", "squares", "samples", "best")
 
 
-class LearningEnded(Exception):  # noqa: N818 - no error
-    """Signal that the run is complete and learning must end."""
+class TrainingCompleted(Exception):  # noqa: N818 - no error
+    """Raised to leave Stable-Baselines3's learning loop after the last step of a training."""
 
 
 class Watcher(BaseCallback):
@@ -100,7 +100,7 @@ class Watcher(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         if self.complete:
-            raise LearningEnded
+            raise TrainingCompleted
         if self._resumed is not None:
             # Stable-Baselines3 draws state-dependent noise between the start of a training and the
             # first rollout, so the state is restored a second time.

@@ -6,7 +6,7 @@ from typing import Any
 
 from codrl_mj.actuators import Drive
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.axes import AXES, REAL, arm, ideal_trial
+from codrl_mj.study.axes import AXES, REAL, ideal_trial, make_arm
 from codrl_mj.study.bench import drive_with_designed_loop
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import named_actuator
@@ -64,7 +64,7 @@ def drawn(task: str, axis: str, trained: float | None = None) -> Arm:
             f"controller.current_noise=uniform(0, {actuator.controller.current_noise:g})"
         ),
     }[axis]()
-    return arm(task, f"{axis}, drawn", dataclasses.replace(largest_env, randomize=(text,)))
+    return make_arm(task, f"{axis}, drawn", dataclasses.replace(largest_env, randomize=(text,)))
 
 
 def drawn_up_to(axis: str, trained: float) -> float:
@@ -80,7 +80,7 @@ def designed(task: str) -> Drive:
 @functools.cache
 def matched(task: str, axis: str) -> Arm:
     """Return the arm trained at a fixed severity of one axis."""
-    return arm(task, axis, AXES[axis].make_env(task, AXES[axis].training_severity[task]))
+    return make_arm(task, axis, AXES[axis].make_env(task, AXES[axis].training_severity[task]))
 
 
 def trial_at(arm: Arm, axis: str, severity: float) -> Trial:

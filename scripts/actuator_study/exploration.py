@@ -6,7 +6,7 @@ from actuator_study import arms
 from actuator_study.arms import trial_at, with_fields
 from actuator_study.questions import on_loop, through_loop
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.axes import AXES, SECONDS, ideal, study_env, supply, timestep
+from codrl_mj.study.axes import AXES, SECONDS, ideal_arm, study_env, supply, timestep
 from codrl_mj.study.trials import Trial
 from codrl_mj.tasks import find_task
 
@@ -21,8 +21,10 @@ def windup() -> dict[str, list[tuple[Trial, Trial]]]:
     return {
         task: [
             (
-                trial_at(ideal(task), "supply", severity),
-                Trial(ideal(task), f"supply {severity:g}, winding up", wound_up(task, severity)),
+                trial_at(ideal_arm(task), "supply", severity),
+                Trial(
+                    ideal_arm(task), f"supply {severity:g}, winding up", wound_up(task, severity)
+                ),
             )
             for severity in AXES["supply"].severities[1:]
         ]
@@ -57,7 +59,7 @@ def around_the_paper() -> dict[str, list[Trial]]:
         ]
         for task in arms.LOOPED
         for name, arm in (
-            ("ideal-trained", ideal(task)),
+            ("ideal-trained", ideal_arm(task)),
             ("trained on it", through_loop(task, "paper")),
         )
     }

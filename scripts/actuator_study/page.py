@@ -21,7 +21,7 @@ from actuator_study.questions import (
 from actuator_study.units import THINGS, scale, severity_text, short, size
 from codrl_mj.runs.files import write_json
 from codrl_mj.study.advice import BUY, IDEAL, RANDOMIZE, THROUGH
-from codrl_mj.study.axes import AXES, FLOORS, SECONDS, ideal, ideal_trial
+from codrl_mj.study.axes import AXES, FLOORS, SECONDS, ideal_arm, ideal_trial
 from codrl_mj.study.evidence import STUDIES, Evidence, Outcome
 from codrl_mj.study.inference import detectable_difference
 from codrl_mj.study.pages import TITLES, markdown_table, read_conclusions, write_csv, write_page
@@ -30,7 +30,7 @@ from codrl_mj.study.trials import (
     FAILURE_MARGIN,
     RUNS,
     TOTALS,
-    Collected,
+    StudyResults,
     Trial,
     run_rows,
     trial_rows,
@@ -50,7 +50,7 @@ QUESTIONS: Mapping[str, str] = {
 """Titles of the sections of questions, by name."""
 
 
-def write(collected: Collected, out: Path) -> list[Path]:
+def write(collected: StudyResults, out: Path) -> list[Path]:
     """Write page, figures and tables.
 
     Args:
@@ -62,7 +62,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
     """
     folder, scores = (
         out / FOLDER,
-        Scores(collected, FLOORS, [ideal_trial(ideal(task)) for task in SECONDS]),
+        Scores(collected, FLOORS, [ideal_trial(ideal_arm(task)) for task in SECONDS]),
     )
     primary_verdicts, secondary_verdicts = (
         judge(scores, primary(), primary=True),
@@ -91,7 +91,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
 
 def write_tables(
     folder: Path,
-    collected: Collected,
+    collected: StudyResults,
     scores: Scores,
     primary_verdicts: Sequence[Verdict],
     secondary_verdicts: Sequence[Verdict],
@@ -123,7 +123,7 @@ def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:
     paths |= {name: folder / f"{name}.svg" for name in ("tune", "motors")}
     loops: dict[str, list[tuple[str, Trial]]] = {
         f"{TITLES[task]},\n{loop}": [
-            ("ideal-trained", on_loop(ideal(task), loop)),
+            ("ideal-trained", on_loop(ideal_arm(task), loop)),
             ("trained through it", on_loop(through_loop(task, loop), loop)),
         ]
         for task in arms.LOOPED
@@ -132,7 +132,7 @@ def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:
     figures.bars(paths["tune"], scores, loops, "The paper's motor under three loops")
     motors: dict[str, list[tuple[str, Trial]]] = {}
     for task in SECONDS:
-        home = ideal(task)
+        home = ideal_arm(task)
         motors[TITLES[task].replace("Continuous ", "Continuous\n")] = [
             ("ideal-trained, on ideal forces", ideal_trial(home)),
             ("ideal-trained, on the good motor", on_motor(home, "good")),
@@ -410,7 +410,7 @@ variants of the paper's loop.
 {_figure(drawn, "tune", QUESTIONS["tune"])}"""
 
 
-def _missing(collected: Collected) -> str:
+def _missing(collected: StudyResults) -> str:
     if not collected.totals.missing:
         return ""
     shown = [f"- failed: {name}: {error}" for name, error in list(collected.failures.items())[:10]]
@@ -431,10 +431,10 @@ def _missing(collected: Collected) -> str:
     )
 
 
-def _method(collected: Collected, scores: Scores) -> str:
+def _method(collected: StudyResults, scores: Scores) -> str:
     grid, totals = collected.grid, collected.totals
     num_trained, num_planned = totals.trainings, len(grid.cells)
-    tested, tests = sum(map(len, collected.evaluations.values())), len(grid.deployments)
+    tested, tests = sum(map(len, collected.evaluations.values())), len(grid.policy_tests)
     codes = (
         ", ".join(f"`{code}` ({count})" for code, count in sorted(totals.codes.items())) or "none"
     )

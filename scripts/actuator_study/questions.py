@@ -19,7 +19,15 @@ from actuator_study.arms import (
 )
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.axes import AXES, SECONDS, arm, generic, ideal, ideal_trial, study_env
+from codrl_mj.study.axes import (
+    AXES,
+    SECONDS,
+    generic_arm,
+    ideal_arm,
+    ideal_trial,
+    make_arm,
+    study_env,
+)
 from codrl_mj.study.questions import Contrast, Question
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
@@ -39,7 +47,7 @@ def _contrasts(axis: str, arm_of: Any, reference_arm_of: Any) -> tuple[Contrast,
 
 @functools.cache
 def _generic(task: str) -> Arm:
-    return generic(ideal(task))
+    return generic_arm(ideal_arm(task))
 
 
 def on_loop(arm: Arm, loop: str) -> Trial:
@@ -51,7 +59,9 @@ def on_loop(arm: Arm, loop: str) -> Trial:
 
 def through_loop(task: str, loop: str) -> Arm:
     """Return the arm trained on the paper's motor under a current loop."""
-    return arm(task, loop, study_env(task, arms.designed(task) if loop == "designed" else loop))
+    return make_arm(
+        task, loop, study_env(task, arms.designed(task) if loop == "designed" else loop)
+    )
 
 
 def on_motor(arm: Arm, kind: str) -> Trial:
@@ -63,7 +73,7 @@ def on_motor(arm: Arm, kind: str) -> Trial:
 def through_motor(task: str, label: str = "", **changes: Any) -> Arm:
     """Return the arm trained through the marginal motor, with labeled changes to it."""
     named = ", ".join(filter(None, ["marginal motor", label]))
-    return arm(task, named, study_env(task, MARGINAL[task], **changes))
+    return make_arm(task, named, study_env(task, MARGINAL[task], **changes))
 
 
 WRONG: dict[str, tuple[str, float]] = {
@@ -119,7 +129,7 @@ def identified(task: str) -> Arm:
         return f"motor.{name}=uniform({value * (1 - share):g}, {value * (1 + share):g})"
 
     text = around("resistance", 0.02), around("inductance", 0.1)
-    return arm(task, "weaker, drawn", dataclasses.replace(nominal, randomize=text))
+    return make_arm(task, "weaker, drawn", dataclasses.replace(nominal, randomize=text))
 
 
 def _mean_wrong(task: str, names: Iterable[str]) -> list[Contrast]:
@@ -144,7 +154,7 @@ def primary() -> list[Question]:
                 " trained on ideal forces",
                 # `axis=axis` binds the loop variable now; a plain closure would see the last
                 # axis.
-                _contrasts(axis, lambda task, axis=axis: matched(task, axis), ideal),
+                _contrasts(axis, lambda task, axis=axis: matched(task, axis), ideal_arm),
             )
             for number, axis in numbered
         ),
@@ -182,7 +192,7 @@ def primary() -> list[Question]:
             " policies that were trained through it",
             tuple(
                 Contrast(
-                    on_loop(ideal(task), "designed"),
+                    on_loop(ideal_arm(task), "designed"),
                     on_loop(through_loop(task, "weaker"), "weaker"),
                 )
                 for task in LOOPED
@@ -201,7 +211,7 @@ def primary() -> list[Question]:
             "motors",
             "On a good off-the-shelf motor, ideal-trained policies score as high as on ideal forces",
             tuple(
-                Contrast(on_motor(ideal(task), "good"), ideal_trial(ideal(task)))
+                Contrast(on_motor(ideal_arm(task), "good"), ideal_trial(ideal_arm(task)))
                 for task in SECONDS
             ),
             "equivalent",
@@ -213,7 +223,7 @@ def primary() -> list[Question]:
             " ideal-trained ones",
             tuple(
                 Contrast(
-                    on_motor(through_motor(task), "marginal"), on_motor(ideal(task), "marginal")
+                    on_motor(through_motor(task), "marginal"), on_motor(ideal_arm(task), "marginal")
                 )
                 for task in MARGINAL
             ),
@@ -226,7 +236,7 @@ def secondary() -> list[Question]:
     """Return all secondary questions by section; each is one contrast."""
     contrasts: list[tuple[str, str, Trial, Trial]] = []
     for task in SECONDS:
-        home = ideal(task)
+        home = ideal_arm(task)
         for axis, described in AXES.items():
             for severity in described.severities[1:]:
                 statement = f"{task}, ideal-trained: {axis} {severity:g} over none"
@@ -242,9 +252,9 @@ def secondary() -> list[Question]:
         for axis in AXES:
             through, generic = matched(task, axis), _generic(task)
             for trained, reference in (
-                (through, ideal(task)),
+                (through, ideal_arm(task)),
                 (through, generic),
-                (generic, ideal(task)),
+                (generic, ideal_arm(task)),
             ):
                 pair = _trained_trial(trained, axis), _trained_trial(reference, axis)
                 contrasts.append(("matters", f"{pair[0].name}, over {reference.name}", *pair))
@@ -255,7 +265,7 @@ def secondary() -> list[Question]:
             )
             contrasts.append(("matters", f"{task}, {axis}: drawn over matched", *pair))
     for task in LOOPED:
-        home, nominal, open_ = ideal(task), through_loop(task, "weaker"), identified(task)
+        home, nominal, open_ = ideal_arm(task), through_loop(task, "weaker"), identified(task)
         for loop in ("weaker", "paper", "designed"):
             statement = f"{task}, {loop} loop: trained through it over ideal-trained"
             contrasts.append(
@@ -277,18 +287,18 @@ def secondary() -> list[Question]:
                 )
             )
     for task in SECONDS:
-        home = ideal(task)
+        home = ideal_arm(task)
         contrasts.append(
             ("motors", f"{task}: good motor over ideal", on_motor(home, "good"), ideal_trial(home))
         )
     for task in MARGINAL:
-        marginal_trial = on_motor(ideal(task), "marginal")
+        marginal_trial = on_motor(ideal_arm(task), "marginal")
         contrasts.append(
             (
                 "motors",
                 f"{task}: marginal motor over ideal",
                 marginal_trial,
-                ideal_trial(ideal(task)),
+                ideal_trial(ideal_arm(task)),
             )
         )
         statement = f"{task}, marginal motor: trained through it over ideal-trained"

@@ -13,14 +13,14 @@ import numpy as np
 from codrl_mj.runs import EPISODES, RESULT
 from codrl_mj.runs.files import read_json
 from codrl_mj.study.pages import read_csv
-from codrl_mj.study.trials import Collected
+from codrl_mj.study.trials import StudyResults
 
 LEARNING = "learning.csv"
 """File with a row for every run: mean return of the episodes that ended in each tenth."""
 TENTHS = tuple(f"tenth_{number}" for number in range(1, 11))
 
 
-def learning_rows(collected: Collected, published: Path) -> list[dict[str, Any]]:
+def learning_rows(collected: StudyResults, published: Path) -> list[dict[str, Any]]:
     """Return a row for every run: the published one, or else one from its run folder."""
     known = {row["run"]: row for row in read_csv(published)}
     rows: list[dict[str, Any]] = []

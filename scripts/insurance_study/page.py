@@ -18,7 +18,7 @@ from actuator_study.page import (
     write_tables,
 )
 from actuator_study.units import THINGS, severity_text
-from codrl_mj.study.axes import AXES, FLOORS, ideal, ideal_trial
+from codrl_mj.study.axes import AXES, FLOORS, ideal_arm, ideal_trial
 from codrl_mj.study.pages import (
     COLORS,
     TITLES,
@@ -30,7 +30,7 @@ from codrl_mj.study.pages import (
     write_page,
 )
 from codrl_mj.study.questions import MARGIN, Scores, Verdict, judge
-from codrl_mj.study.trials import FAILURE_MARGIN, RUNS, Collected, Trial
+from codrl_mj.study.trials import FAILURE_MARGIN, RUNS, StudyResults, Trial
 from codrl_mj.tasks import find_task
 from insurance_study.learning import LEARNING, learning_rows, still_rising
 from insurance_study.questions import (
@@ -105,7 +105,7 @@ class Summary(NamedTuple):
         return f"{np.mean(self.scores):z.2f}{median}; {failed}{tests}; {100 * success:.0f} %"
 
 
-def summarize(collected: Collected, scores: Scores, trials: Iterable[Trial]) -> Summary:
+def summarize(collected: StudyResults, scores: Scores, trials: Iterable[Trial]) -> Summary:
     """Summarize the results of every policy in every trial."""
     pairs: list[tuple[float, float]] = []
     for trial in trials:
@@ -117,7 +117,7 @@ def summarize(collected: Collected, scores: Scores, trials: Iterable[Trial]) -> 
     return Summary(values[:, 0], values[:, 1])
 
 
-def write(collected: Collected, out: Path) -> list[Path]:
+def write(collected: StudyResults, out: Path) -> list[Path]:
     """Write page, figures and tables; missing results are named on the page.
 
     Returns:
@@ -125,7 +125,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
     """
     folder, scores = (
         out / FOLDER,
-        Scores(collected, FLOORS, [ideal_trial(ideal(task)) for task in TASKS]),
+        Scores(collected, FLOORS, [ideal_trial(ideal_arm(task)) for task in TASKS]),
     )
     primary_verdicts = judge(scores, primary(), primary=True, min_policies=PLANNED)
     secondary_verdicts = judge(scores, secondary(), min_policies=PLANNED)
@@ -148,7 +148,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
     return [out / PAGE, folder / FIGURE, folder / LEARNING, *tables]
 
 
-def _things(collected: Collected, scores: Scores) -> str:
+def _things(collected: StudyResults, scores: Scores) -> str:
     """Return a table for each task: a row for each axis, results of the kinds to choose from."""
     tables = []
     for task in TASKS:
@@ -197,7 +197,7 @@ share of [the voltage that the task needs](plan.md#severities)."""
 {chr(10).join(tables)}"""
 
 
-def _kinds(collected: Collected, scores: Scores) -> str:
+def _kinds(collected: StudyResults, scores: Scores) -> str:
     rows = []
     for kind, name in KIND_NAMES.items():
         cells = [name]
@@ -315,11 +315,11 @@ def _secondary(verdicts: Sequence[Verdict]) -> str:
 {decided_table(verdicts, SECTION_TITLES)}"""
 
 
-def _method(collected: Collected, rising: Sequence[str], count: int) -> str:
+def _method(collected: StudyResults, rising: Sequence[str], count: int) -> str:
     totals, num_planned = collected.totals, len(collected.grid.cells)
     num_tested, num_tests = (
         sum(map(len, collected.evaluations.values())),
-        len(collected.grid.deployments),
+        len(collected.grid.policy_tests),
     )
     text = f"""The study follows [its plan](insurance_plan.md), with the scores and tests of [the first
 study](actuators.md). It has {num_tested} of {num_tests} tests of {num_planned} policies

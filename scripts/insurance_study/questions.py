@@ -8,7 +8,7 @@ from actuator_study.arms import DRAWN
 from actuator_study.arms import drawn as drawn_severities
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.axes import AXES, arm, ideal, ideal_trial, study_env, timestep
+from codrl_mj.study.axes import AXES, ideal_arm, ideal_trial, make_arm, study_env, timestep
 from codrl_mj.study.questions import Contrast, Question
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
@@ -69,7 +69,7 @@ def generic(
         pulse_force=0.25 * share * force, pulse_duration=step, pulse_interval=10 * step
     )
     fields: dict[str, Any] = {"disturbances": pushes} if with_pushes else {}
-    return arm(task, name, study_env(task, late(task), randomize=drawn, **fields))
+    return make_arm(task, name, study_env(task, late(task), randomize=drawn, **fields))
 
 
 @functools.cache
@@ -77,7 +77,7 @@ def pushes(task: str) -> Arm:
     """Return the arm trained on random pushes only."""
     step, force = find_task(task).step_duration, find_task(task).max_force
     pushed = Disturbances(pulse_force=0.25 * force, pulse_duration=step, pulse_interval=10 * step)
-    return arm(task, "random pushes alone", study_env(task, disturbances=pushed))
+    return make_arm(task, "random pushes alone", study_env(task, disturbances=pushed))
 
 
 def strength(task: str) -> Arm:
@@ -98,7 +98,7 @@ def double(task: str) -> Arm:
 @functools.cache
 def through(task: str, axis: str) -> Arm:
     """Return the arm trained at the severity of one axis."""
-    return arm(task, axis, AXES[axis].make_env(task, SEVERITIES[task][axis]))
+    return make_arm(task, axis, AXES[axis].make_env(task, SEVERITIES[task][axis]))
 
 
 @functools.cache
@@ -120,7 +120,9 @@ def remembering_env(task: str, axis: str, severity: float) -> EnvConfig:
 @functools.cache
 def remembering(task: str, axis: str) -> Arm:
     """Return the arm trained at the severity of one axis, seeing its last four commands."""
-    return arm(task, f"{axis}, remembering", remembering_env(task, axis, SEVERITIES[task][axis]))
+    return make_arm(
+        task, f"{axis}, remembering", remembering_env(task, axis, SEVERITIES[task][axis])
+    )
 
 
 def trial_at(arm: Arm, axis: str, severity: float | None = None) -> Trial:
@@ -152,7 +154,7 @@ def neighbors(task: str, axis: str) -> dict[str, float]:
 
 Kind = Callable[[str, str], Arm]
 KINDS: Mapping[str, Kind] = {
-    "ideal": lambda task, axis: ideal(task),  # noqa: ARG005
+    "ideal": lambda task, axis: ideal_arm(task),  # noqa: ARG005
     "matched": through,
     "drawn": drawn,
     "remembering": remembering,
@@ -184,7 +186,7 @@ def home_contrasts(
 ) -> tuple[Contrast, ...]:
     """Return the contrasts of a kind with ideal-trained policies, both on ideal forces."""
     return tuple(
-        Contrast(home(KINDS[kind](task, axis)), home(ideal(task)))
+        Contrast(home(KINDS[kind](task, axis)), home(ideal_arm(task)))
         for task in tasks
         for axis in axes
     )
@@ -302,7 +304,7 @@ def secondary() -> list[Question]:
                 for side, severity in neighbors(task, axis).items():
                     pair = Contrast(
                         trial_at(KINDS[kind](task, axis), axis, severity),
-                        trial_at(ideal(task), axis, severity),
+                        trial_at(ideal_arm(task), axis, severity),
                     )
                     parts.append(
                         (
@@ -318,7 +320,7 @@ def secondary() -> list[Question]:
 def trials() -> tuple[Trial, ...]:
     """Return every trial of the study once, including those of the first study's arms."""
     contrasts = [pair for question in (*primary(), *secondary()) for pair in question.contrasts]
-    homes = [Contrast(ideal_trial(ideal(task)), ideal_trial(ideal(task))) for task in TASKS]
+    homes = [Contrast(ideal_trial(ideal_arm(task)), ideal_trial(ideal_arm(task))) for task in TASKS]
     return tuple({trial.name: trial for pair in (*contrasts, *homes) for trial in pair}.values())
 
 

@@ -11,7 +11,7 @@ from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import holds_since
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.pages import read_csv
-from codrl_mj.study.trials import Collected, to_scalar, training_seconds
+from codrl_mj.study.trials import StudyResults, to_scalar, training_seconds
 from codrl_mj.tasks import TASKS
 from codrl_mj.tasks.pendulum import GOAL_HOLD, MAX_TORQUE, upright_angle
 from codrl_mj.training import EVALUATION_SEED
@@ -127,7 +127,7 @@ def times_of(text: str) -> np.ndarray:
     return np.array([np.inf if time == "-" else float(time) for time in text.split()])
 
 
-def read_trained(arm: PaperArm, collected: Collected) -> dict[int, Trained]:
+def read_trained(arm: PaperArm, collected: StudyResults) -> dict[int, Trained]:
     """Return the runs of an arm that are finished and tested, by seed.
 
     Raises:

@@ -28,7 +28,7 @@ from codrl_mj.actuators import (
     parameter_paths,
     parameters_type,
 )
-from codrl_mj.fields import flag, integer, part, real
+from codrl_mj.fields import flag, integer, optional_nested, real
 from tests.actuators.strategies import of_every_family
 
 
@@ -47,7 +47,7 @@ class Nested(ActuatorModel):
     arm_radius: float = real(0.5, above=0.0)
     on: bool = flag(True)
     always: Inner = Inner(gain=3.0)
-    maybe: Inner | None = part(Inner(gain=4.0))
+    maybe: Inner | None = optional_nested(Inner(gain=4.0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Open(Nested):
     """Family that declares a more general part than its default."""
 
     always: Inner = Finer(gain=3.0)
-    maybe: Any = part(Inner(gain=4.0))
+    maybe: Any = optional_nested(Inner(gain=4.0))
 
 
 def test_parts_have_the_declared_type_not_that_of_the_default():

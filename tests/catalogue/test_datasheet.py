@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from codrl_mj.catalogue import Datasheet, derivation, from_datasheet, motor_entry, units
-from codrl_mj.catalogue.datasheet import KINDS, to_field_names
+from codrl_mj.catalogue.datasheet import QUANTITY_SPECS, to_field_names
 
 UNITS = {  # SI value of one unit, by definition
     "V": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
@@ -61,15 +61,18 @@ POLOLU = {
 
 
 @pytest.mark.parametrize(
-    ("kind", "unit"), [(kind, unit) for kind, sizes in units._USUAL.items() for unit in sizes]
+    ("kind", "unit"),
+    [(kind, unit) for kind, sizes in units._COMMON_UNITS.items() for unit in sizes],
 )
 def test_common_units_have_exactly_pints_sizes(kind, unit, monkeypatch):
     numbers = [
-        units.to_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)
+        units.to_si(number, unit, kind, mass_as_weight=True)
+        for number in (1.0, 0.1, 12345.678, -3e-7)
     ]
-    monkeypatch.setattr(units, "_USUAL", {})
+    monkeypatch.setattr(units, "_COMMON_UNITS", {})
     assert numbers == [
-        units.to_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)
+        units.to_si(number, unit, kind, mass_as_weight=True)
+        for number in (1.0, 0.1, 12345.678, -3e-7)
     ]
 
 
@@ -102,7 +105,7 @@ def _print(draw, printed):
     """Return the values as text, each in a randomly chosen unit."""
     text = {}
     for name, value in printed.items():
-        unit, size = draw(st.sampled_from(sorted(UNITS[KINDS[name].unit].items())))
+        unit, size = draw(st.sampled_from(sorted(UNITS[QUANTITY_SPECS[name].unit].items())))
         text[name] = f"{value / size!r} {unit}"
     return text
 
@@ -337,7 +340,9 @@ def test_a_disagreement_has_both_values_and_an_explanation():
 
 
 def test_a_phase_of_a_star_may_be_written_as_a_product():
-    assert Datasheet(resistance="2 * 0.3 ohm").readings()["resistance"].value == pytest.approx(0.6)
+    assert Datasheet(resistance="2 * 0.3 ohm").parsed_values()["resistance"].value == pytest.approx(
+        0.6
+    )
 
 
 @pytest.mark.parametrize(
@@ -372,7 +377,7 @@ def test_a_phase_of_a_star_may_be_written_as_a_product():
 )
 def test_values_are_read_in_manufacturers_spellings(name, printed, value):
     """Compare with definitions: kgf 9.80665 N, oz 28.349523 g, in 25.4 mm, a turn 2 pi."""
-    (reading,) = Datasheet(**to_field_names({name: printed})).readings().values()
+    (reading,) = Datasheet(**to_field_names({name: printed})).parsed_values().values()
     assert reading.value == pytest.approx(value, rel=1e-6)
 
 
@@ -523,7 +528,7 @@ def test_contradictions_are_only_listed_if_not_strict():
 def test_the_rules_use_fields_only():
     for quantity, formula in (*derivation.RULES, *(check[:2] for check in derivation.CHECKS)):
         assert {quantity, *derivation.compile_formula(formula).co_names} <= {
-            *KINDS,
+            *QUANTITY_SPECS,
             *derivation.AT_OUTPUT,
         }, formula
     first = derivation.compile_formula(derivation.RULES[0][1])
@@ -563,7 +568,7 @@ SERVO = {
     ],
 )
 def test_the_time_for_an_angle_is_a_speed(printed):
-    reading = Datasheet(**SERVO | {"no_load_speed": printed}).readings()["no_load_speed"]
+    reading = Datasheet(**SERVO | {"no_load_speed": printed}).parsed_values()["no_load_speed"]
     assert reading.value == pytest.approx(math.pi / 3.0 / 0.222, rel=1e-15)
     assert reading.shaft == "output"
 

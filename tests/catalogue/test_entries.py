@@ -9,7 +9,7 @@ import pytest
 from gym_electric_motor.physical_systems.electric_motors import DcPermanentlyExcitedMotor
 
 from codrl_mj.catalogue import motor_entry, motor_names
-from codrl_mj.catalogue.datasheet import KINDS, Datasheet
+from codrl_mj.catalogue.datasheet import QUANTITY_SPECS, Datasheet
 
 NAMES = motor_names()
 EXPLAINED = {  # disagreements above 5 % -> explanation in the notes
@@ -52,7 +52,7 @@ def test_the_catalogue_has_motors_of_many_kinds():
 @pytest.mark.parametrize("name", NAMES)
 def test_every_value_has_a_source_or_a_reason(name):
     entry = motor_entry(name)
-    printed = {field for field in KINDS if getattr(entry.datasheet, field) is not None}
+    printed = {field for field in QUANTITY_SPECS if getattr(entry.datasheet, field) is not None}
     assert entry.sources.keys() | entry.estimated.keys() == printed
     assert not entry.sources.keys() & entry.estimated.keys()
     assert all(len(text) > 20 for text in (*entry.sources.values(), *entry.estimated.values()))
@@ -76,7 +76,7 @@ def test_a_motor_is_consistent_or_its_notes_explain_why_not(name):
 def test_the_model_meets_the_printed_operating_points(name):
     """Solve two equations, winding and shaft, for the free motor, and for the blocked one."""
     entry = motor_entry(name)
-    numbers, printed = entry.parameters, entry.datasheet.readings()
+    numbers, printed = entry.parameters, entry.datasheet.parsed_values()
     friction = (numbers.coulomb_friction or 0.0), (numbers.viscous_friction or 0.0)
     if {"no_load_speed", "nominal_voltage"} <= printed.keys():
         matrix = [

@@ -28,7 +28,7 @@ FULL = DCMotorActuator(
 """Actuator that uses every feature."""
 
 
-TICK = SlotHeader._fields.index("tick")
+TICK = SlotHeader._fields.index("state_time")
 _SIZE = len(DCMotorActuator.State._fields)
 STATE = [SLOT_HEADER_SIZE + _SIZE + entry for entry in range(_SIZE)]
 """Entries of `data.act` with a current loop's state of the last step: current, integral, error."""

@@ -136,7 +136,7 @@ def test_setting_the_clock_back_or_forward_changes_neither_motor_nor_motion(shif
     twin.time += shift
     rest, shifted = (trajectory(model, INPUTS[40:], start) for start in (data, twin))
     np.testing.assert_array_equal(rest[:, 1:3], shifted[:, 1:3])  # position, velocity
-    np.testing.assert_array_equal(rest[:, 4:], shifted[:, 4:])  # motor state but for its tick
+    np.testing.assert_array_equal(rest[:, 4:], shifted[:, 4:])  # motor state but for its time
 
 
 def test_the_tick_is_the_start_of_the_last_step_and_a_reset_brings_the_motor_to_rest():

@@ -32,7 +32,7 @@ from codrl_mj.engine.families import (
     slot_size,
     user_header,
 )
-from codrl_mj.fields import flag, integer, part, real
+from codrl_mj.fields import flag, integer, optional_nested, real
 from codrl_mj.physics import (
     AnalyticPhysics,
     MujocoPhysics,
@@ -107,7 +107,7 @@ class Spring(ActuatorModel):
     advance = staticmethod(_advance)
 
     coil: Coil = Coil()
-    brake: Brake | None = part(Brake())
+    brake: Brake | None = optional_nested(Brake())
     limit: float = real(0.5, above=0.0)
     soft: bool = flag(False)
     arm_radius: float = real(0.4, above=0.0)

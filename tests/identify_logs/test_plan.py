@@ -40,7 +40,7 @@ def find_option(result, kind, rate):
 
 def test_the_best_option_reaches_its_goals_at_the_lowest_rate(planned):
     best = planned.best
-    assert planned.missed == planned.unknown == []
+    assert planned.missed_goals == planned.unknown == []
     assert set(best.errors) == set(GOALS)
     assert all(best.errors[name] <= goal / MARGIN for name, goal in GOALS.items())
     assert not [

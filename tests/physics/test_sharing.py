@@ -35,7 +35,7 @@ def work():
 
 
 class _Batch:
-    """Rows, and lanes that count the rows they processed."""
+    """BatchRows, and lanes that count the rows they processed."""
 
     def __init__(self, count, threads, rounds=0):
         self.board, self.lanes = (

@@ -11,7 +11,7 @@ import pytest
 
 from codrl_mj.catalogue import motor_names
 from codrl_mj.cli import main
-from codrl_mj.sizing import Abilities, find_drive, find_entry
+from codrl_mj.sizing import DriveLimits, find_drive, find_entry
 from codrl_mj.viz.pages.diagrams import torque_speed_diagram
 
 OWN = """
@@ -69,7 +69,7 @@ def test_list_has_every_motor(capsys):
     assert content["units"]["stall_torque"] == "N*m"
     assert set(content["units"]) == rows[0].keys() - {"name", "kind"}
     assert [row["name"] for row in rows] == motor_names()
-    assert set(Abilities._fields) < rows[0].keys()
+    assert set(DriveLimits._fields) < rows[0].keys()
 
 
 def test_show_prints_the_source_of_every_number(capsys):
@@ -103,7 +103,7 @@ def test_show_accepts_a_custom_datasheet_and_any_drive(capsys):
     text = printed_by(capsys, "show", "own.toml", "--out", ".")
     parts = (
         "we ours, brushed",
-        "Abilities at its output, at 12 V",
+        "Limits at the output, at 12 V",
         "assumed",
         "The motor, at its rotor",
         "source 1",

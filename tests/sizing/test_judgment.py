@@ -149,7 +149,9 @@ def test_no_policy_trained_through_the_motor_contradicts_a_verdict(furuta):
             COOL,
         )
         assert judgment.verdict == row["verdict"]
-        assert judgment.operation.own_share == pytest.approx(float(row["own_share"]), rel=0.05)
+        assert judgment.operating_points.own_share == pytest.approx(
+            float(row["own_share"]), rel=0.05
+        )
         assert judgment.verdict != SURELY or float(row["success"]) >= 0.9
         assert judgment.verdict not in (HOPELESS, SURELY_NOT) or float(row["success"]) <= 0.2
     assert {SURELY, TRY_IT} == {row["verdict"] for row in rows}
@@ -190,7 +192,7 @@ def test_a_motor_on_which_policies_failed_is_not_judged_surely(furuta, pololu):
     choices = choose(furuta, [str(pololu[1])], gears=gears)
     assert [choice.ratio for choice in choices] == pytest.approx(sorted(gears))
     assert {choice.feasibility.verdict for choice in choices} == {TRY_IT}
-    shares = [choice.feasibility.operation.own_share for choice in choices]
+    shares = [choice.feasibility.operating_points.own_share for choice in choices]
     assert shares == sorted(shares)
     assert shares[0] < 0.5 < 1.0 < shares[1] < 3.0 < shares[2]
     assert all(

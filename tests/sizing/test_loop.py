@@ -9,12 +9,12 @@ import pytest
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Drive, SampledLoop
 from codrl_mj.sizing import (
+    analyze_loop,
+    analyze_sample_rates,
     closed_loop,
-    design,
-    designs,
     find_drive,
-    gains,
     is_closed,
+    loop_gains,
     open_loop,
     simulate_loop,
     small_step_response,
@@ -46,7 +46,9 @@ def measured_gain(drive, frequency, samples=400):
 @with_and_without_delay
 def test_the_design_agrees_with_closed_forms(name, rate, delayed):
     """The loop is P/(z - 1), with a delay P/(z*(z - 1)): P = 1 - exp(-2*pi*bandwidth/rate)."""
-    figures = design(find_drive(name, sample_rate=rate, bandwidth=0.05 * rate, delayed=delayed))
+    figures = analyze_loop(
+        find_drive(name, sample_rate=rate, bandwidth=0.05 * rate, delayed=delayed)
+    )
     share = -math.expm1(-2 * math.pi * 0.05)
     crossover = 2 * math.asin(share / 2)  # angle of a sample [rad]
     assert figures.gain_margin == pytest.approx((1 if delayed else 2) / share, rel=1e-6)
@@ -68,7 +70,7 @@ def test_the_design_agrees_with_closed_forms(name, rate, delayed):
 @with_and_without_delay
 def test_the_simulated_loop_has_the_computed_bandwidth_and_margins(name, delayed):
     drive = find_drive(name, delayed=delayed)
-    figures = design(drive)
+    figures = analyze_loop(drive)
     around = figures.bandwidth * np.linspace(0.9, 1.1, 5)
     sweep = [abs(measured_gain(drive, frequency)) for frequency in around]
     bandwidth = np.interp(-math.sqrt(0.5), -np.array(sweep), around)
@@ -93,11 +95,11 @@ def test_the_simulated_step_agrees_with_python_control(delayed, fields):
     response = simulate_loop(drive, np.full(200, 0.01))
     _, currents = control.step_response(closed_loop(drive), response.time)
     np.testing.assert_allclose(response.current, 0.01 * currents, atol=1e-9)
-    figures = design(drive)
+    figures = analyze_loop(drive)
     if not fields:
         assert figures.overshoot == pytest.approx(max(currents.max() - 1, 0), abs=1e-9)
     assert math.isnan(figures.settling_time) == ("ki" not in fields and bool(fields))
-    assert (figures.kp, figures.ki) == gains(drive)
+    assert (figures.kp, figures.ki) == loop_gains(drive)
 
 
 @with_and_without_delay
@@ -107,7 +109,7 @@ def test_the_simulated_step_agrees_with_python_control(delayed, fields):
 def test_the_margins_agree_with_python_control(loop, delayed):
     drive = Drive(controller=SampledLoop(delayed=delayed, **loop))
     gain_margin, phase_margin, gain_at, phase_at = control.margin(open_loop(drive))
-    figures = design(drive)
+    figures = analyze_loop(drive)
     assert (figures.phase_margin, figures.crossover) == pytest.approx(
         (phase_margin, phase_at / 2 / math.pi), rel=1e-6
     )
@@ -136,7 +138,7 @@ def test_the_loop_of_an_actuator_agrees_with_python_control_s_series(loop):
         response.current, 0.01 * control.step_response(joined, response.time)[1], atol=1e-9
     )
     figures, (_, phase_margin, _, phase_at) = (
-        design(actuator, timestep),
+        analyze_loop(actuator, timestep),
         control.margin(open_loop(actuator, timestep)),
     )
     assert (figures.phase_margin, figures.crossover) == pytest.approx(
@@ -148,11 +150,13 @@ def test_the_loop_of_an_actuator_agrees_with_python_control_s_series(loop):
 def test_raises_if_an_actuator_s_loop_has_no_timestep_or_gain():
     assert not is_closed(DCMotorActuator(controller=CurrentLoop(kp=0.0, kff=1.0)))
     with pytest.raises(ValueError, match="timestep = None: must be the mechanical step"):
-        design(DCMotorActuator())
+        analyze_loop(DCMotorActuator())
 
 
 def test_designs_at_other_rates_exist_if_the_bandwidth_allows():
-    designs_ = designs(find_drive("quanser-qube-servo-2", bandwidth=2000.0, sample_rate=25e3))
+    designs_ = analyze_sample_rates(
+        find_drive("quanser-qube-servo-2", bandwidth=2000.0, sample_rate=25e3)
+    )
     assert [rate for rate, delayed in designs_ if delayed] == [10e3, 20e3, 25e3, 40e3]
     assert "must be <= 1591.55 Hz" in designs_[10e3, False]
     assert designs_[40e3, True].phase_margin > designs_[20e3, True].phase_margin
@@ -160,7 +164,7 @@ def test_designs_at_other_rates_exist_if_the_bandwidth_allows():
 
 
 def test_a_slow_loop_has_a_bandwidth_but_no_settling_time():
-    figures = design(find_drive("quanser-qube-servo-2", bandwidth=0.1))
+    figures = analyze_loop(find_drive("quanser-qube-servo-2", bandwidth=0.1))
     assert figures.bandwidth == pytest.approx(0.1, rel=1e-3)
     assert math.isnan(figures.settling_time)
     with pytest.raises(ValueError, match=r"sample_rate = 500: must be >= 1000 Hz"):
@@ -168,7 +172,7 @@ def test_a_slow_loop_has_a_bandwidth_but_no_settling_time():
 
 
 def test_raises_if_the_loop_is_unstable():
-    for judge in (design, step_responses):
+    for judge in (analyze_loop, step_responses):
         with pytest.raises(
             ValueError, match=r"unstable: spectral radius .* Lower controller\.kp = 500"
         ):

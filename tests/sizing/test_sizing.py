@@ -29,9 +29,9 @@ from codrl_mj.sizing import (
     min_energy_gain,
     min_pumped_energy,
     min_supply_voltage,
-    operation,
+    operating_points,
 )
-from codrl_mj.sizing.abilities import max_power
+from codrl_mj.sizing.limits import max_power
 from codrl_mj.sizing.scripted import Scripted, observe_state
 from codrl_mj.tasks import TASKS
 from tests.matrix import matrix_params
@@ -93,7 +93,7 @@ def test_a_steady_load_follows_the_motor_equation():
     motor = dataclasses.replace(
         MOTOR, gear_ratio=20.0, coulomb_friction=1e-3, viscous_friction=1e-6
     )
-    required = operation(steady(1.5, 8.0), drive(motor))
+    required = operating_points(steady(1.5, 8.0), drive(motor))
     torque = 1.5 / 20.0 + 1e-3 + 1e-6 * 160.0
     assert required.torque == pytest.approx(torque)
     assert required.voltage == pytest.approx(2.0 * torque / 0.05 + 0.04 * 160.0)
@@ -105,7 +105,7 @@ def test_a_steady_load_follows_the_motor_equation():
 def test_rotor_and_gear_add_to_the_load():
     time = np.linspace(0.0, 2.0, 2001)
     motor = dataclasses.replace(MOTOR, gear_ratio=30.0, gear_efficiency=0.8)
-    required = operation(
+    required = operating_points(
         demand_from_arrays(time, np.zeros_like(time), 5.0 * np.sin(4.0 * time)), drive(motor)
     )
     driving = np.cos(4.0 * time) * np.sin(4.0 * time) > 0.0
@@ -117,7 +117,7 @@ def test_a_torque_step_adds_l_di_dt_to_the_voltage():
     """Torque steps of 1.5 N*m in 0.1 s at 8 rad/s: a rise needs more voltage, a fall less."""
     slow = dataclasses.replace(MOTOR, inductance=0.05, rotor_inertia=0.0)
     torque = np.array([0.0, 1.5, 1.5, 0.0])
-    required = operation(
+    required = operating_points(
         demand_from_arrays(0.1 * np.arange(4), torque, np.full(4, 8.0)), drive(slow)
     )
     current, rise, back_emf = 1.5 / 0.05, 0.05 * 30.0 / 0.1, 0.04 * 8.0
@@ -136,7 +136,7 @@ def test_the_best_gear_minimizes_the_voltage():
     light = dataclasses.replace(MOTOR, rotor_inertia=0.0)
 
     def voltage(gear):
-        return operation(
+        return operating_points(
             steady(1.5, 8.0), drive(dataclasses.replace(light, gear_ratio=gear))
         ).voltage[0]
 
@@ -249,13 +249,13 @@ def test_friction_and_damping_raise_the_supply_of_a_swing_up(pendulum):
     rough = dataclasses.replace(PAPER, coulomb_friction=0.1)
     assert min_energy_gain(pendulum.swing, drive(rough, 5.5)) < light
     assert min_energy_gain(pendulum.swing._replace(damping=0.05), drive(voltage=5.5)) < light
-    assert min_pumped_energy(pendulum.swing._replace(largest=6.0), drive()) == math.inf
+    assert min_pumped_energy(pendulum.swing._replace(max_torque=6.0), drive()) == math.inf
 
 
 def test_a_surely_sufficient_motor_does_not_change_the_run(pendulum):
     """At 10 V the run equals the ideal one, up to the delay of L/R = 0.1 ms."""
     quick = drive(dataclasses.replace(PAPER, inductance=1e-4), 10.0)
-    assert operation(pendulum, quick).voltage.max() <= 10.0
+    assert operating_points(pendulum, quick).voltage.max() <= 10.0
     assert feasibility(quick, pendulum, COOL).verdict == SURELY
     assert np.abs(from_hanging(quick) - from_hanging(Ideal())).max() < 0.005
 
@@ -264,7 +264,7 @@ def test_the_first_choice_delivers_the_demand(pendulum):
     first = choose(pendulum)[0]
     assert first.feasibility.verdict == SURELY
     required, family, state, delivered = (
-        first.feasibility.operation,
+        first.feasibility.operating_points,
         type(first.drive),
         Drive.State(*[0.0] * len(Drive.State._fields)),
         [],
@@ -287,7 +287,7 @@ def test_the_smallest_suitable_motor_comes_first_and_the_others_have_reasons(
     assert choices[: len(good)] == good
     assert [choice.power for choice in good] == sorted(choice.power for choice in good)
     assert min(choice.feasibility.margin for choice in good) >= 0.2
-    assert max(choice.feasibility.operation.own_share for choice in good) <= 0.5
+    assert max(choice.feasibility.operating_points.own_share for choice in good) <= 0.5
     assert {choice.feasibility.verdict for choice in good} == {SURELY}
     assert not any("continuous current" in choice.unknown for choice in good)
     others = {choice.name: choice for choice in choices[len(good) :]}
@@ -335,7 +335,7 @@ def test_the_gear_limits_the_rotor_share_for_tasks_and_maximizes_the_margin_of_r
         choose(drive_, ["maxon-ec45-flat-50w"])[0].feasibility
         for drive_ in (recording, dataclasses.replace(recording, exact=False))
     )
-    assert bound.operation.own_share < 0.5 < 1.0 < free.operation.own_share
+    assert bound.operating_points.own_share < 0.5 < 1.0 < free.operating_points.own_share
     assert 0.5 < bound.margin < free.margin
 
 

@@ -15,7 +15,7 @@ def pretend(grid, score, leaving_out=()):
         score: function (trial, seed) -> mean return.
         leaving_out: (arm, seed) of trainings that are left out.
     """
-    folders, tests = grid.folders, grid.deployments
+    folders, tests = grid.folders, grid.policy_tests
     for cell, config in grid.cells.items():
         if cell not in leaving_out:
             folders[cell].mkdir(parents=True)

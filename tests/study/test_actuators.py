@@ -19,7 +19,15 @@ from actuator_study.questions import primary, secondary, trials, wrong_motors
 from actuator_study.study import ActuatorStudy
 from codrl_mj.actuators import Lag
 from codrl_mj.evaluation.measures import Interval
-from codrl_mj.study.axes import AXES, FLOORS, SECONDS, ideal, ideal_trial, needed_voltage, study_env
+from codrl_mj.study.axes import (
+    AXES,
+    FLOORS,
+    SECONDS,
+    ideal_arm,
+    ideal_trial,
+    needed_voltage,
+    study_env,
+)
 from codrl_mj.study.evidence import Evidence
 from codrl_mj.study.program import main
 from codrl_mj.study.questions import Scores, Verdict, judge
@@ -51,7 +59,7 @@ def unpublished_study(root, **options):
 def primary_verdicts(grid):
     """Return the verdicts of the primary questions."""
     return judge(
-        Scores(grid.collect(), FLOORS, [ideal_trial(ideal(task)) for task in SECONDS]),
+        Scores(grid.collect(), FLOORS, [ideal_trial(ideal_arm(task)) for task in SECONDS]),
         primary(),
         primary=True,
     )
@@ -326,7 +334,7 @@ def test_every_number_on_the_page_is_in_a_file(study, tmp_path):
         in page
     )
     assert len(page.splitlines()) <= 190
-    assert len(list(csv.DictReader(files["runs.csv"].open()))) == len(study.deployments)
+    assert len(list(csv.DictReader(files["runs.csv"].open()))) == len(study.policy_tests)
     assert (
         sum(file.stat().st_size for name, file in files.items() if name.endswith(".svg")) < 500_000
     )

@@ -118,15 +118,15 @@ def test_slowly_creeping_force_counts_as_missing():
     """A PI loop reaches kp/(kp + R) with (L/R)/(1 + kp/R), and the rest with (1 + kp)/ki."""
     step, dt = find_task("pendulum").step_duration, timestep("pendulum")
     loop = CurrentLoop(kp=1.0, ki=2.0 / (1000 * step), max_voltage=1e3)
-    delivery = measure_on_task(DCMotorActuator(Motor(1.0, 10 * dt, 1.0, 1.0), loop), "pendulum")
-    assert delivery.at_rest == pytest.approx(1.0 - 0.5 * math.exp(-0.02), abs=2e-3)
+    response = measure_on_task(DCMotorActuator(Motor(1.0, 10 * dt, 1.0, 1.0), loop), "pendulum")
+    assert response.at_rest == pytest.approx(1.0 - 0.5 * math.exp(-0.02), abs=2e-3)
     # Lag of the force that is present in the 20th step: the fast half decays by a fifth in each of
     # ten integration steps, and the other half creeps.
     quick, slow = (
         np.sum(0.8 ** np.arange(1, 100)) / 10.0,
         1000.0 * (1.0 - math.exp(-0.02)) - 20.0 * math.exp(-0.0195),
     )
-    assert delivery.lag == pytest.approx(0.5 * (quick + slow) / delivery.at_rest, abs=0.005)
+    assert response.lag == pytest.approx(0.5 * (quick + slow) / response.at_rest, abs=0.005)
 
 
 # evidence
@@ -377,7 +377,7 @@ def test_a_larger_command_compensates_the_losses_of_a_gear(evidence):
         drive, motor=dataclasses.replace(drive.motor, gear_efficiency=0.8), controller=limit
     )
     advice = advise(lossy, "pendulum", evidence)
-    assert advice.delivery.at_rest == pytest.approx(0.8, abs=1e-3)
+    assert advice.response.at_rest == pytest.approx(0.8, abs=1e-3)
     assert (advice.verdict, "by 1.25" in advice.reason) == (COMMAND, True)
     short = dataclasses.replace(lossy, controller=drive.controller)  # No spare current.
     advice = advise(short, "pendulum", evidence)
@@ -416,7 +416,7 @@ def test_a_force_without_command_is_not_called_negligible(evidence):
     share = (
         0.1 * paper.motor.torque_constant / paper.motor.arm_radius / find_task("pendulum").max_force
     )
-    assert advice.delivery.unasked == pytest.approx(share, rel=0.05)
+    assert advice.response.unasked == pytest.approx(share, rel=0.05)
 
 
 def test_the_largest_tested_severity_is_not_beyond_the_tests(evidence):
@@ -433,7 +433,7 @@ def test_ringing_counts_as_lag(evidence):
     speed = 0.9 / find_task("pendulum").step_duration
     loop = CurrentLoop(kp=0.0, ki=speed**2, max_voltage=1e6, substeps=100)
     advice = advise(DCMotorActuator(Motor(0.2 * speed, 1.0, 1.0, 1.0), loop), "pendulum", evidence)
-    assert advice.delivery.lag > 1.0
+    assert advice.response.lag > 1.0
     assert advice.verdict != IDEAL
 
 
@@ -513,7 +513,7 @@ def test_measurements_use_the_study_s_environments(task, tmp_path):
 def test_raises_if_a_measurement_is_not_finished(tmp_path):
     measurement = plan_measurement(named_actuator("weaker", "cartpole"), "cartpole", 2, tmp_path)
     pretend(measurement.grid, lambda *_: 100.0, leaving_out=[("cartpole: through it", 1)])
-    with pytest.raises(ValueError, match=r"1 of its trainings and tests are missing"):
+    with pytest.raises(ValueError, match=r"1 of the measurement's trainings and tests are missing"):
         measurement.loss_bounds(measurement.grid.collect())
 
 

@@ -16,14 +16,14 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.grid import (
-    Deployment,
+    PolicyTest,
     cell_folder,
-    deploy_cells,
     failure_record,
     read_failure,
+    run_tests,
     train_runs,
 )
-from codrl_mj.study.parallel import Workers, compute
+from codrl_mj.study.parallel import Workers, call_in_parallel
 from codrl_mj.training import TrainConfig, finished, load_config
 
 PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=1, hidden=(8,))
@@ -182,7 +182,7 @@ except TrainingStoppedError as stopped:
             text, _ = grid.communicate(timeout=60)
         assert (grid.returncode, text) == (
             130,
-            "stopped: the same command goes on from the last checkpoints\n",
+            "stopped: the same command continues from the last checkpoints\n",
         )
         for run in ("0", "1")[:count]:
             assert list((root / run / "checkpoints").iterdir())
@@ -191,40 +191,40 @@ except TrainingStoppedError as stopped:
 
 def test_an_exception_in_a_call_is_raised():
     with pytest.raises(ZeroDivisionError):
-        list(compute(divmod, [(1, 1), (1, 0)], Workers(jobs=2)))
+        list(call_in_parallel(divmod, [(1, 1), (1, 0)], Workers(jobs=2)))
 
 
 @pytest.mark.matrix
 def test_deployments_are_evaluated_once(computed):
     _, runs, _, _ = computed
-    deployments = {
-        name: Deployment(runs["seed 0"], EnvConfig("cartpole", name), episodes=3, seed=7)
+    policy_tests = {
+        name: PolicyTest(runs["seed 0"], EnvConfig("cartpole", name), episodes=3, seed=7)
         for name in ("paper", "ideal")
     }
-    deploy_cells(deployments, ONE)
-    for deployment in deployments.values():
+    run_tests(policy_tests, ONE)
+    for deployment in policy_tests.values():
         expected = evaluate(load_policy(runs["seed 0"]), deployment.env, episodes=3, seed=7)
         assert json.loads(deployment.record.read_text())["returns"] == expected.returns._asdict()
     before = {
         deployment.record: deployment.record.stat().st_mtime_ns
-        for deployment in deployments.values()
+        for deployment in policy_tests.values()
     }
     assert len(before) == 2
-    deploy_cells(deployments, ONE)
+    run_tests(policy_tests, ONE)
     assert {record: record.stat().st_mtime_ns for record in before} == before
-    other_env = Deployment(
+    other_env = PolicyTest(
         runs["seed 0"], EnvConfig("cartpole", max_episode_steps=5), episodes=3, seed=7
     )
-    deploy_cells({"short": other_env}, ONE)
+    run_tests({"short": other_env}, ONE)
     assert json.loads(other_env.record.read_text())["length"]["mean"] == 5.0
 
 
 @pytest.mark.matrix
 def test_a_deployment_that_fails_is_recorded_and_does_not_stop_the_others(computed):
     root, runs, _, _ = computed
-    good, bad = (Deployment(runs["seed 1"], env, episodes=2, seed=3) for env in (IDEAL, UNSTABLE))
+    good, bad = (PolicyTest(runs["seed 1"], env, episodes=2, seed=3) for env in (IDEAL, UNSTABLE))
     reported = []
-    deploy_cells({"bad": bad, "good": good}, ONE, reported.append)
+    run_tests({"bad": bad, "good": good}, ONE, reported.append)
     assert (bad.record.is_file(), good.record.is_file()) == (False, True)
     assert sorted(reported) == ["bad", "good"]
     assert failure_record(bad).parent == root / "failures"
@@ -241,17 +241,17 @@ def test_a_deployment_that_fails_is_recorded_and_does_not_stop_the_others(comput
 def test_a_failure_record_of_a_deployment_is_deleted_when_it_succeeds(computed):
     _, runs, _, _ = computed
     deployment, policy = (
-        Deployment(runs["seed 2"], IDEAL, episodes=2),
+        PolicyTest(runs["seed 2"], IDEAL, episodes=2),
         runs["seed 2"] / "policy.json",
     )
     content = policy.read_text()
     policy.write_text("{")
     try:
-        deploy_cells({"cell": deployment}, ONE)
+        run_tests({"cell": deployment}, ONE)
     finally:
         policy.write_text(content)
     assert "policy.json" in read_failure(deployment)
-    deploy_cells({"cell": deployment}, ONE)
+    run_tests({"cell": deployment}, ONE)
     assert deployment.record.is_file()
     assert read_failure(deployment) is None
 

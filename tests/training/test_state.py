@@ -11,7 +11,7 @@ from stable_baselines3.common.logger import Logger
 
 from codrl_mj.envs.sb3 import make_sb3_vec_env
 from codrl_mj.training.checkpoint import State, capture, restore
-from codrl_mj.training.watcher import LearningEnded
+from codrl_mj.training.watcher import TrainingCompleted
 from tests.matrix import matrix_params
 from tests.training.interruptions import CASES
 
@@ -73,7 +73,7 @@ class Stretch(BaseCallback):
     def _on_rollout_start(self):
         if self.model.num_timesteps >= self.end:
             self.reached = copy.deepcopy(capture(self.model, self.training_env))
-            raise LearningEnded
+            raise TrainingCompleted
         self._restore()
         self.start = None
 
@@ -106,7 +106,7 @@ class Learner:
     def learn(self, start, end):
         """Return the resulting state, and the episodes by name."""
         stretch = Stretch(start, end)
-        with pytest.raises(LearningEnded):
+        with pytest.raises(TrainingCompleted):
             self.model.learn(10**6, callback=stretch, log_interval=None)
         return stretch.reached, {
             **stretch.reached.arrays,

@@ -16,7 +16,7 @@ JSON_NAME, HTML_NAME = "certificate.json", "certificate.html"
 _CHECKS = ("check", "oracle", "samples", "worst", "allowed", "margin", "unit", "where", "verdict")
 
 
-def html(certificate: Certificate, caught: Sequence[MutationResult] = ()) -> str:
+def html(certificate: Certificate, results: Sequence[MutationResult] = ()) -> str:
     """Return the page of a certificate, with the results of injected faults if there are any."""
     top = [page.mark_verdict(certificate.passed, certificate.verdict, "p", "verdict")]
     if certificate.quick:
@@ -36,7 +36,7 @@ def html(certificate: Certificate, caught: Sequence[MutationResult] = ()) -> str
         if skipped
         else Markup()
     )
-    sections += [_mutations(certificate, caught)] if caught else []
+    sections += [_mutations(certificate, results)] if results else []
     sections.append(page.Section("skipped", "Not checked", skipped_table))
     return page.page(
         f"Is the port correct? {certificate.subject}",
@@ -81,9 +81,9 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
     return page.Section(name, name.capitalize(), page.join(body), mark)
 
 
-def _mutations(certificate: Certificate, caught: Sequence[MutationResult]) -> page.Section:
+def _mutations(certificate: Certificate, results: Sequence[MutationResult]) -> page.Section:
     rows = []
-    for outcome in caught:
+    for outcome in results:
         clearest, cells = (
             outcome.clearest_failure,
             [
@@ -102,7 +102,7 @@ def _mutations(certificate: Certificate, caught: Sequence[MutationResult]) -> pa
         mark = page.mark_verdict(clearest is not None, "MISSED" if clearest is None else "caught")
         rows.append((*cells, *clearest_cells, mark))
     columns = "fault", "in", "failed", "clearest check", "worst", "allowed", "beyond", "verdict"
-    never_failed = undetected_checks(certificate.checks, caught)
+    never_failed = undetected_checks(certificate.checks, results)
     names = "; ".join(f"{check.group}, {check.task}: {check.name}" for check in never_failed)
     body = (
         page.paragraph(
@@ -116,7 +116,7 @@ def _mutations(certificate: Certificate, caught: Sequence[MutationResult]) -> pa
             rows,
             numbers=(2, 4, 5, 6),
             cards=True,
-            failed=(index for index, outcome in enumerate(caught) if not outcome.failed),
+            failed=(index for index, outcome in enumerate(results) if not outcome.failed),
         ),
         (
             page.note(f"✗ These checks fail for no fault: {names}", bad=True)
@@ -152,7 +152,7 @@ def summary(content: Mapping[str, Any]) -> Markup:
 
 
 def write(
-    certificate: Certificate, folder: Path, caught: Sequence[MutationResult] = ()
+    certificate: Certificate, folder: Path, results: Sequence[MutationResult] = ()
 ) -> tuple[Path, Path]:
     """Write `certificate.json` and `certificate.html` into a folder, replacing older ones.
 
@@ -160,12 +160,14 @@ def write(
     """
     text = (
         json.dumps(
-            certificate.as_mapping() | as_mapping(certificate, caught), indent=2, allow_nan=False
+            certificate.as_mapping() | as_mapping(certificate, results),
+            indent=2,
+            allow_nan=False,
         )
         + "\n"
     )
     # Build both texts before the files are opened, so that an error leaves the older pair in place.
-    html_text = html(certificate, caught)
+    html_text = html(certificate, results)
     check_writable(folder)
     with (
         atomic_write(folder / JSON_NAME) as json_file,

@@ -19,15 +19,15 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.sizing import (
     CurrentLoopActuator,
-    LoopDesign,
+    LoopAnalysis,
     Response,
-    abilities,
+    analyze_loop,
     closed_loop,
-    design,
+    drive_limits,
     open_loop,
     small_step_response,
 )
-from codrl_mj.sizing.abilities import diagram_limits, highest_current, torque_limits
+from codrl_mj.sizing.limits import diagram_limits, highest_current, torque_limits
 from codrl_mj.sizing.loop import StepResponses
 from codrl_mj.viz.pages.plots import Curve, Plot
 
@@ -55,15 +55,15 @@ def torque_speed_diagram(drive: Drive, numbers: Any = None, points: Any = None) 
     Raises:
         ValueError: the drive has no finite no-load speed, or `points` have another shape.
     """
-    drive_abilities, lines = abilities(drive), diagram_limits(drive, numbers)
+    limits, lines = drive_limits(drive), diagram_limits(drive, numbers)
     points = np.empty((0, 2)) if points is None else np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(
             f"points: shape {points.shape}, must be (n, 2): speed [rad/s] and torque [N*m]"
         )
-    width = 1.15 * max(drive_abilities.no_load_speed, *np.abs(points[:, 0]), 0.0)
+    width = 1.15 * max(limits.no_load_speed, *np.abs(points[:, 0]), 0.0)
     height = 1.25 * max(
-        min(drive_abilities.stall_torque, 3.0 * drive_abilities.peak_torque),
+        min(limits.stall_torque, 3.0 * limits.peak_torque),
         *np.abs(points[:, 1]),
         0.0,
     )
@@ -82,23 +82,20 @@ def torque_speed_diagram(drive: Drive, numbers: Any = None, points: Any = None) 
         curves += envelope(
             names, speeds, torques, color_index == peak, colour=color_index, dashed=color_index == 2
         )
-    remark = " (outside the plot)" if drive_abilities.stall_torque > height else ""
-    stall = (
-        f"stall, {drive_abilities.stall_torque:,.4g} N·m,"
-        f" {drive_abilities.stall_current:,.4g} A{remark}"
-    )
-    no_load = f"no load, {drive_abilities.no_load_speed:.4g} rad/s"
+    remark = " (outside the plot)" if limits.stall_torque > height else ""
+    stall = f"stall, {limits.stall_torque:,.4g} N·m, {limits.stall_current:,.4g} A{remark}"
+    no_load = f"no load, {limits.no_load_speed:.4g} rad/s"
     curves += [
         Curve(
             stall,
             np.zeros(2),
-            drive_abilities.stall_torque * np.array([1.0, -1.0]),
+            limits.stall_torque * np.array([1.0, -1.0]),
             style="trail",
             colour=4,
         ),
         Curve(
             no_load,
-            drive_abilities.no_load_speed * np.array([1.0, -1.0]),
+            limits.no_load_speed * np.array([1.0, -1.0]),
             np.zeros(2),
             style="trail",
             colour=3,
@@ -241,7 +238,7 @@ def bode_diagram(drive: Drive) -> list[Plot]:
     Raises:
         ValueError: the loop is unstable.
     """
-    loop_design = design(drive)
+    loop_design = analyze_loop(drive)
     gain, phase = bode_plots({"": (drive, None)}, {"": loop_design})
     delay_text = "a sample of delay" if loop_design.delayed else "no delay"
     gains = f"kp = {loop_design.kp:.4g} V/A, ki = {loop_design.ki:,.5g} V/(A·s)"
@@ -254,7 +251,7 @@ def bode_diagram(drive: Drive) -> list[Plot]:
     ]
 
 
-def bode_plots(loops: Loops, designed: Mapping[str, LoopDesign]) -> list[Plot]:
+def bode_plots(loops: Loops, designed: Mapping[str, LoopAnalysis]) -> list[Plot]:
     """Return gain and phase of loops, open and closed; for a single loop with its margins."""
     gains, phases = [], []
     for index, (name, loop) in enumerate(loops.items()):
@@ -289,7 +286,7 @@ def bode_plots(loops: Loops, designed: Mapping[str, LoopDesign]) -> list[Plot]:
     ]
 
 
-def _margins(loop_design: LoopDesign, ends: np.ndarray) -> tuple[list[Curve], list[Curve]]:
+def _margins(loop_design: LoopAnalysis, ends: np.ndarray) -> tuple[list[Curve], list[Curve]]:
     """Return curves that mark margins and bandwidth in the plots of gain and phase.
 
     Args:

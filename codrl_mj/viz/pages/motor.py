@@ -1,4 +1,4 @@
-"""Page of a motor: its numbers with their sources, its abilities, and its current loop."""
+"""Page of a motor: its numbers with their sources, its limits, and its current loop."""
 
 import math
 from collections.abc import Mapping
@@ -9,7 +9,14 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Drive
 from codrl_mj.catalogue import MotorEntry
-from codrl_mj.sizing import LoopDesign, describe_unknown, design, designs, explain, step_responses
+from codrl_mj.sizing import (
+    LoopAnalysis,
+    analyze_loop,
+    analyze_sample_rates,
+    describe_motor,
+    describe_unknown,
+    step_responses,
+)
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.diagrams import (
     Loops,
@@ -35,11 +42,11 @@ _SCALES = {"settling_time": 1e3, "overshoot": 100.0}
 
 def loop_section(loops: Loops) -> Markup:
     """Return margins, Bode plots and small steps of current loops."""
-    designs_by_name: dict[str, LoopDesign] = {}
+    designs_by_name: dict[str, LoopAnalysis] = {}
     notes = []
     for name, (loop, timestep) in loops.items():
         try:
-            designs_by_name[name] = design(loop, timestep)
+            designs_by_name[name] = analyze_loop(loop, timestep)
         except ValueError as error:
             notes.append(page.note(f"{name}: {error}", bad=True))
     if not designs_by_name:
@@ -85,7 +92,7 @@ def loop_section(loops: Loops) -> Markup:
     )
 
 
-def _display_value(loop_design: LoopDesign, field: str) -> float:
+def _display_value(loop_design: LoopAnalysis, field: str) -> float:
     value = getattr(loop_design, field)
     return 20.0 * math.log10(value) if field == "gain_margin" else value * _SCALES.get(field, 1.0)
 
@@ -95,9 +102,9 @@ def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> 
 
     Return the file.
     """
-    explanation = explain(drive, entry)
+    explanation = describe_motor(drive, entry)
     sections = [
-        page.Section("abilities", "Abilities", _abilities(explanation, drive, entry)),
+        page.Section("abilities", "Limits", _abilities(explanation, drive, entry)),
         page.Section("loop", "Current loop", _loop(name, drive)),
         page.Section("numbers", "The motor, at its rotor", _numbers(explanation)),
         page.Section(
@@ -152,7 +159,7 @@ def _loop(name: str, drive: Drive) -> Markup:
         parts = [parts[0], page.note(str(error))]
     current_setting = drive.controller.sample_rate, drive.controller.delayed
     rows = []
-    for (rate, delayed), candidate in designs(drive).items():
+    for (rate, delayed), candidate in analyze_sample_rates(drive).items():
         name = (
             f"{rate / 1e3:g} kHz, {'a sample' if delayed else 'no'}"
             f" delay{' (as it is)' * ((rate, delayed) == current_setting)}"

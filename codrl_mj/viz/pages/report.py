@@ -21,7 +21,7 @@ from codrl_mj.runs.summaries import (
     describe_rank,
     median_seed,
     read_evaluation,
-    read_reports,
+    read_progress,
     read_run,
 )
 from codrl_mj.sizing import CurrentLoopActuator, is_closed
@@ -244,7 +244,7 @@ def _learning(runs: Sequence[RunEpisode]) -> Markup:
     evaluations: list[Curve] = []
     errors: list[Curve] = []
     for index, run in enumerate(runs):
-        reports = read_reports(run.summary.path / PROGRESS, [])
+        reports = read_progress(run.summary.path / PROGRESS, [])
         columns = [
             [row.get(name, "nan") for row in reports]
             for name in ("steps", "evaluation_return", "torque_error")

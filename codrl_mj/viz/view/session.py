@@ -18,7 +18,7 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import override_actuator
 from codrl_mj.evaluation import RandomPolicy
-from codrl_mj.fields import field_docs, parts
+from codrl_mj.fields import field_docs, nested_types
 
 _NO_LIMIT = 10**9  # environment steps
 _DIVERGENCE_WARNINGS = (
@@ -79,7 +79,7 @@ def controls(
         path: names of the parts that lead to `settings`.
     """
     kind: Any = type(settings)
-    result, nested, docs = [], parts(kind), field_docs(kind)
+    result, nested, docs = [], nested_types(kind), field_docs(kind)
     for field in dataclasses.fields(settings):
         value, field_path, documentation = (
             getattr(settings, field.name),

@@ -8,7 +8,7 @@ import numpy as np
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Inputs, Motor, Supply, parameters_type
 from codrl_mj.cli import main
-from codrl_mj.sizing import abilities, explain, find_drive
+from codrl_mj.sizing import describe_motor, drive_limits, find_drive
 from codrl_mj.viz.pages.diagrams import no_load_speed, torque_range, torque_speed_diagram
 from codrl_mj.viz.pages.motor import _abilities
 from tests.viz.pages.parsed import check_self_contained
@@ -26,7 +26,7 @@ def test_the_command_writes_a_page_with_every_number(tmp_path, capsys):
 
 def test_assumed_values_are_listed_below_the_abilities():
     drive = find_drive("kraken-x60")
-    text = str(_abilities(explain(drive), drive, None))
+    text = str(_abilities(describe_motor(drive), drive, None))
     assert "at 12 V" in text
     assert (
         "assumed, because not specified: controller.max_current = inf, motor.rotor_inertia = 0."
@@ -36,7 +36,7 @@ def test_assumed_values_are_listed_below_the_abilities():
 
 def test_the_diagram_goes_through_stall_and_no_load():
     drive = find_drive("maxon-ec45-flat-50w", gear_ratio=12.0)
-    can, plot = abilities(drive), torque_speed_diagram(drive)
+    can, plot = drive_limits(drive), torque_speed_diagram(drive)
     highest = next(curve for curve in plot.curves if re.match("voltage.*highest", curve.label))
     assert abs(np.interp(can.no_load_speed, highest.x, highest.y)) < 1e-3 * can.stall_torque
     assert highest.y.max() > can.stall_torque  # braking

@@ -3,7 +3,7 @@
 Source: maxon, *Key information on maxon DC and EC motors*; `codrl_mj.catalogue` derives its numbers
 by the same relations. As in the simulation, the gear multiplies a driving torque kT*I by its
 efficiency, and a braking torque by 1/efficiency. Then friction at the output, n*(c + n*b*|omega|),
-opposes the speed. All torques in this module are net of both losses, and so move the load.
+opposes the speed. All torques in this module act on the load, net of both losses.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ import numpy as np
 
 from codrl_mj.actuators import Drive, GearMotor, Servo, ServoLoop, override_actuator, resolve
 from codrl_mj.catalogue import MotorEntry, MotorParameters, motor_entry, motor_names
-from codrl_mj.catalogue.datasheet import KINDS
+from codrl_mj.catalogue.datasheet import QUANTITY_SPECS
 from codrl_mj.catalogue.derivation import PRINTED_NAMES
 from codrl_mj.fields import check_names
 
@@ -80,10 +80,10 @@ def find_entry(name: Any) -> MotorEntry | None:
     return motor_entry(name) if known else None
 
 
-class Abilities(NamedTuple):
+class DriveLimits(NamedTuple):
     """Limits of a drive at its supply's voltage.
 
-    Only power and peak torque include `max_current`.
+    Only `power` and `peak_torque` respect the drive's `max_current`.
     """
 
     power: float
@@ -105,13 +105,13 @@ class Abilities(NamedTuple):
     """Mechanical time constant R*J/(kT*kE) of the rotor [s]; NaN if its inertia is unknown (0)."""
 
 
-ABILITY_UNITS = dict(
-    zip(Abilities._fields, ("W", "N*m", "N*m", "A", "rad/s", "A", "s", "s"), strict=True)
+LIMIT_UNITS = dict(
+    zip(DriveLimits._fields, ("W", "N*m", "N*m", "A", "rad/s", "A", "s", "s"), strict=True)
 )
-"""Units of the fields of `Abilities`."""
+"""Units of the fields of `DriveLimits`, by name."""
 
 
-def abilities(drive: Drive) -> Abilities:
+def drive_limits(drive: Drive) -> DriveLimits:
     """Return the limits of a drive."""
     motor, resistance = drive.motor, drive.motor.resistance + drive.supply_resistance
     torque_per_current = motor.torque_constant * motor.gear_efficiency  # [N*m/A]
@@ -128,7 +128,7 @@ def abilities(drive: Drive) -> Abilities:
         np.array([min(stall_current, drive.controller.max_current), stall_current]),
         np.zeros(2),
     )
-    return Abilities(
+    return DriveLimits(
         max_power(drive),
         float(peak_torque),
         float(blocked_torque),
@@ -162,7 +162,7 @@ def continuous_torque(drive: Drive, current: float | None) -> float | None:
     )
 
 
-def diagram_limits(drive: Drive, numbers: Any = None) -> list[tuple[str, float, int]]:
+def diagram_limits(drive: Drive, parameters: Any = None) -> list[tuple[str, float, int]]:
     """Return the limits of a drive for a torque-speed diagram, as (name, current [A], kind).
 
     The kind is 0 for the voltage limit, whose current is infinite, 1 for the peak current and 2 for
@@ -170,12 +170,12 @@ def diagram_limits(drive: Drive, numbers: Any = None) -> list[tuple[str, float, 
 
     Args:
         drive: drive.
-        numbers: `MotorParameters` of its datasheet; None leaves out the continuous current.
+        parameters: `MotorParameters` of its datasheet; None leaves out the continuous current.
 
     Raises:
         ValueError: the no-load speed, at which the diagram ends, is not finite or not positive.
     """
-    limits, peak_current = abilities(drive), drive.controller.max_current
+    limits, peak_current = drive_limits(drive), drive.controller.max_current
     if not 0.0 < limits.no_load_speed < math.inf or limits.stall_torque <= 0.0:
         raise ValueError(
             f"GearMotor.back_emf_constant = {drive.motor.back_emf_constant:g}, Supply.voltage ="
@@ -186,7 +186,7 @@ def diagram_limits(drive: Drive, numbers: Any = None) -> list[tuple[str, float, 
     lines = [(f"voltage, {drive.voltage_limit:g} V", math.inf, 0)]
     if math.isfinite(peak_current):
         lines.append((f"peak current, {peak_current:.3g} A", peak_current, 1))
-    continuous = getattr(numbers, "continuous_current", None)
+    continuous = getattr(parameters, "continuous_current", None)
     return (
         lines
         if continuous is None
@@ -215,14 +215,14 @@ def torque_limits(
 
 
 def highest_current(
-    resistance: float, voltage: float, sag: float, back_emf: np.ndarray
+    resistance: float, voltage: float, supply_resistance: float, back_emf: np.ndarray
 ) -> np.ndarray:
-    """Return the highest steady current [A] of a winding, for u = max(V - sag*|i|, 0)."""
-    # Beyond the no-load speed i < 0, so that u = V + sag*i and (R - sag)*i = V - b. At u = 0 the
-    # back-EMF b alone drives -b/R, which is the lower bound.
-    reverse_resistance = max(resistance - sag, 1e-9 * resistance)
+    """Return the highest steady current [A] of a winding, for u = max(V - Rs*|i|, 0)."""
+    # Beyond the no-load speed i < 0, so that u = V + Rs*i and (R - Rs)*i = V - b, where b is the
+    # back-EMF. At u = 0 the back-EMF alone drives -b/R, which is the lower bound.
+    reverse_resistance = max(resistance - supply_resistance, 1e-9 * resistance)
     steady = (voltage - back_emf) / np.where(
-        back_emf > voltage, reverse_resistance, resistance + sag
+        back_emf > voltage, reverse_resistance, resistance + supply_resistance
     )
     return np.maximum(steady, -back_emf / resistance)
 
@@ -253,12 +253,12 @@ COLUMNS = (
         "rotor_inertia",
         "gear_ratio",
     ),
-    *Abilities._fields,
+    *DriveLimits._fields,
     "continuous_torque",
 )
 """Columns of `catalogue_rows`, in SI units."""
 _ROUNDED = 0.01
-"""Relative difference below which inconsistent values of a datasheet count as rounded."""
+"""Relative difference below which a contradiction in a datasheet is attributed to rounding."""
 
 
 def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
@@ -275,13 +275,11 @@ def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
     check_names([sort], COLUMNS, "column")
     rows = []
     for entry in map(motor_entry, motor_names()):
-        numbers, drive = entry.parameters, Drive.from_motor_parameters(entry.parameters)
-        capabilities = abilities(drive)._asdict()
-        known = {name: getattr(numbers, name) for name in COLUMNS[2:8]}
-        known |= {
-            name: value if math.isfinite(value) else None for name, value in capabilities.items()
-        }
-        known["continuous_torque"] = continuous_torque(drive, numbers.continuous_current)
+        parameters, drive = entry.parameters, Drive.from_motor_parameters(entry.parameters)
+        limits = drive_limits(drive)._asdict()
+        known = {name: getattr(parameters, name) for name in COLUMNS[2:8]}
+        known |= {name: value if math.isfinite(value) else None for name, value in limits.items()}
+        known["continuous_torque"] = continuous_torque(drive, parameters.continuous_current)
         rows.append({"name": entry.name, "kind": entry.kind, **known})
     if sort in ("name", "kind"):
         return sorted(rows, key=lambda row: row[sort])
@@ -289,15 +287,15 @@ def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
 
 
 def find_loop(name: Any) -> ServoLoop | None:
-    """Return the outer loops of a servo, by a name of `find_drive`; None if it is not a servo."""
+    """Return the outer loops of the servo with a name of `find_drive`; None for other actuators."""
     base = resolve(name, None, "a motor on its own")
     return base.loop if isinstance(base, Servo) else None
 
 
-def explain(
+def describe_motor(
     drive: Drive, entry: MotorEntry | None = None, loop: ServoLoop | None = None
 ) -> dict[str, Any]:
-    """Return all known data of a motor: JSON-serializable, except for infinite values.
+    """Return all known data of a motor as JSON-serializable values, of which some may be infinite.
 
     Args:
         drive: drive with motor, controller and supply.
@@ -308,8 +306,8 @@ def explain(
         `drive` (the fields of motor, controller, supply and loop) and `abilities`, each a list of
         mappings with `name`, `value` and `unit`; `assumed`; and for a datasheet `manufacturer`,
         `product`, `kind`, `numbers`, `cited`, `unknown`, `disagreements`, `estimated` and `notes`.
-        Each mapping in `numbers` also has its derivation `how`, its `sources`, and `places`, their
-        positions in `cited`, from 1.
+        Each mapping in `numbers` also has its derivation `how`, its `sources`, and `places`: the
+        numbers of these sources in the list `cited`, counted from 1.
     """
     parts: dict[str, Any] = {
         "motor": drive.motor,
@@ -327,8 +325,8 @@ def explain(
             for field in dataclasses.fields(owner)
         ],
         "abilities": [
-            _value(name, value, ABILITY_UNITS[name])
-            for name, value in abilities(drive)._asdict().items()
+            _value(name, value, LIMIT_UNITS[name])
+            for name, value in drive_limits(drive)._asdict().items()
         ],
         "assumed": drive.assumed,
     }
@@ -359,7 +357,11 @@ def explain(
     return report | {
         **{name: getattr(entry, name) for name in ("manufacturer", "product", "kind")},
         "numbers": [
-            _value(name, getattr(entry.parameters, name), KINDS[PRINTED_NAMES.get(name, name)].unit)
+            _value(
+                name,
+                getattr(entry.parameters, name),
+                QUANTITY_SPECS[PRINTED_NAMES.get(name, name)].unit,
+            )
             | {
                 "how": derived[name],
                 "sources": value_sources,
@@ -384,6 +386,7 @@ def describe_unknown(names: Sequence[str]) -> str:
 
 
 def _value(name: str, value: Any, unit: str) -> dict[str, Any]:
+    """Return an entry of a report."""
     return {"name": name, "value": value, "unit": unit}
 
 

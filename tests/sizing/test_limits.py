@@ -11,9 +11,9 @@ import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, Ideal, SampledLoop, Supply
 from codrl_mj.catalogue import motor_entry, motor_names
 from codrl_mj.sizing import (
-    abilities,
     catalogue_rows,
-    explain,
+    describe_motor,
+    drive_limits,
     find_drive,
     find_entry,
     simulate_loop,
@@ -25,8 +25,8 @@ from codrl_mj.sizing import (
 def test_stall_and_no_load_agree_with_the_datasheet(name):
     entry = motor_entry(name)
     can, printed = (
-        abilities(Drive.from_motor_parameters(entry.parameters)),
-        entry.datasheet.readings(),
+        drive_limits(Drive.from_motor_parameters(entry.parameters)),
+        entry.datasheet.parsed_values(),
     )
     ratio = entry.parameters.gear_ratio
     for field, ours in (("stall_torque", can.stall_torque), ("no_load_speed", can.no_load_speed)):
@@ -39,7 +39,7 @@ def test_stall_and_no_load_agree_with_the_datasheet(name):
 
 
 def test_a_motor_without_redundant_values_reproduces_its_datasheet_exactly():
-    can = abilities(find_drive("pololu-37d-30"))
+    can = drive_limits(find_drive("pololu-37d-30"))
     assert can.stall_torque == pytest.approx(140e-3 * 9.80665, rel=1e-9)  # 140 kgf*mm
     assert can.no_load_speed == pytest.approx(330 * 2 * math.pi / 60, rel=1e-9)  # 330 rpm
     assert can.no_load_current == pytest.approx(0.2, rel=1e-9)
@@ -98,21 +98,21 @@ def test_the_limits_are_the_net_torques_on_a_hinge_in_mujoco(share, max_current)
     """At shares of the no-load speed, which a heavy load keeps constant."""
     drive = Drive(LOSSY, SampledLoop(max_current=max_current))
     model, data = hinge(drive, 100.0)
-    data.qvel[:] = share * abilities(drive).no_load_speed
+    data.qvel[:] = share * drive_limits(drive).no_load_speed
     mujoco.mj_step(model, data, 200)
     speed = data.qvel[0]
     mujoco.mj_step(model, data)
     moved = data.qacc[0] * (100.0 + drive.additions.armature)
     assert moved == pytest.approx(torque_limits(drive, speed, max_current)[1], rel=1e-5)
     if share == 0.01 and max_current == math.inf:
-        assert moved == pytest.approx(abilities(drive).stall_torque, rel=0.02)
+        assert moved == pytest.approx(drive_limits(drive).stall_torque, rel=0.02)
 
 
 def test_a_free_hinge_runs_at_the_no_load_speed_with_the_no_load_current():
     drive = Drive(LOSSY)
     model, data = hinge(drive, 1e-9)
     mujoco.mj_step(model, data, 20_000)
-    can = abilities(drive)
+    can = drive_limits(drive)
     assert data.qvel[0] == pytest.approx(can.no_load_speed, rel=1e-6)
     assert codrl_mj.signals(model, data)["current"] == pytest.approx(can.no_load_current, rel=1e-5)
 
@@ -120,7 +120,7 @@ def test_a_free_hinge_runs_at_the_no_load_speed_with_the_no_load_current():
 def test_the_limits_cross_zero_at_the_no_load_speed():
     for name in motor_names():
         drive = find_drive(name)
-        can = abilities(drive)
+        can = drive_limits(drive)
         assert abs(torque_limits(drive, can.no_load_speed)[1]) < 1e-9 * can.stall_torque
         assert torque_limits(drive, 0.0)[1] == pytest.approx(can.stall_torque, rel=1e-12)
 
@@ -129,7 +129,7 @@ def test_a_current_limit_reduces_torque_and_power():
     """At 12 V, 2 ohm, 0.1 N*m/A: 3 A make 3*(12 - 2*3) W, 1 A makes 1*(12 - 2*1) W."""
     motor = GearMotor(2.0, 1e-3, 0.1, 0.1, gear_ratio=5.0)
     for max_current, amperes in ((math.inf, 3.0), (1.0, 1.0)):
-        can = abilities(Drive(motor, SampledLoop(max_current=max_current), Supply(12.0)))
+        can = drive_limits(Drive(motor, SampledLoop(max_current=max_current), Supply(12.0)))
         assert can.power == pytest.approx(amperes * (12.0 - 2.0 * amperes))
         assert can.peak_torque == pytest.approx(0.5 * min(max_current, 6.0))
         assert can.stall_torque == pytest.approx(3.0)
@@ -156,7 +156,7 @@ def test_a_drive_reports_its_assumptions(drive, text):
 
 
 def test_a_motor_without_back_emf_has_an_infinite_no_load_speed():
-    can = abilities(Drive(GearMotor(back_emf_constant=0.0)))
+    can = drive_limits(Drive(GearMotor(back_emf_constant=0.0)))
     assert can.no_load_speed == math.inf
     assert can.no_load_current == 0.0
 
@@ -224,7 +224,7 @@ def test_catalogue_rows_are_sorted_with_unknown_values_last():
 @pytest.mark.parametrize("name", motor_names())
 def test_explain_has_the_origin_of_every_number(name):
     entry = motor_entry(name)
-    report = explain(Drive.from_motor_parameters(entry.parameters), entry)
+    report = describe_motor(Drive.from_motor_parameters(entry.parameters), entry)
     shown = {row["name"]: row for row in report["numbers"]}
     fields = {field.name for field in dataclasses.fields(entry.parameters)} - {
         "derived",
