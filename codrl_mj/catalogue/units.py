@@ -16,14 +16,12 @@ _TRANSIT = re.compile(
     re.I,
 )
 """Pattern of the speed of servos: the time for an angle, such as 0.16 s/60deg."""
-_ANGLES = {
-    "radian",
-    "degree",
-    "turn",
-    "revolution",
-    "revolutions_per_minute",
-    "revolutions_per_second",
-}
+_OPTIONAL_ANGLE = {"N*m/A", "N*m*s/rad", "V*s/rad", "kg*m^2"}
+"""SI units of quantities that may be stated with or without a division by an angle.
+
+A torque constant in N*m/A has the same value in V*s/rad, and an inertia in kg*m^2 the same in
+N*m*s^2/rad.
+"""
 # Regular expressions for spellings that pint does not know, with their replacements. They are
 # applied one after another, so those of whole units precede the general one for hyphens.
 _SPELLINGS = (
@@ -172,32 +170,50 @@ def to_si(
     if si_unit is not None and unit in (sizes := _COMMON_UNITS.get(si_unit, {})):
         return number * sizes[unit]
     registry = unit_registry()
-    for spelling, plain in _SPELLINGS:
-        unit = re.sub(spelling, plain, unit)
-    # Pint's parser raises errors of many kinds.
+    spelling = unit
+    for pattern, plain in _SPELLINGS:
+        spelling = re.sub(pattern, plain, spelling)
+    # Pint's parser and its conversions raise errors of many kinds.
     try:
-        quantity = registry.Quantity(number, unit)
+        quantity = registry.Quantity(number, spelling)
+        if si_unit is None:
+            return quantity.to_base_units().magnitude
+        unit_size = registry.Quantity(1.0, spelling)
+        zero = registry.Quantity(0.0, spelling).to_root_units().magnitude
     except Exception as error:
         raise ValueError(f"the unit {unit!r} is not known") from error
-    if si_unit is None:
-        return quantity.to_base_units().magnitude
-    dimensionality = registry.Quantity(1.0, si_unit).dimensionality
+    si_size = registry.Quantity(1.0, si_unit)
     # A torque in kg*cm lacks one standard gravity to be a force times a length.
     if (
         mass_as_weight
-        and quantity.dimensionality == dimensionality / registry.standard_gravity.dimensionality
+        and unit_size.dimensionality
+        == si_size.dimensionality / registry.standard_gravity.dimensionality
     ):
-        quantity = quantity * registry.standard_gravity
-    if quantity.dimensionality != dimensionality:
-        raise ValueError(
-            f"{unit!r} is not a unit of {quantity_name}, which is in {si_unit or 'no unit'}"
+        quantity, unit_size = (
+            factor * registry.standard_gravity for factor in (quantity, unit_size)
         )
-    # Pint treats angles as plain numbers, so it would convert Hz and 1/s without a factor of 2*pi.
-    units = {name for name, _ in quantity.unit_items()}
-    if any(name.endswith("hertz") for name in units) or (
-        si_unit.startswith("rad") and not any(name.endswith(tuple(_ANGLES)) for name in units)
+    names = {name for name, _ in unit_size.unit_items()}
+    powers, si_powers = (dict(size.to_root_units().unit_items()) for size in (unit_size, si_size))
+    has_same_dimension = unit_size.dimensionality == si_size.dimensionality
+    if has_same_dimension and (
+        any(name.endswith("hertz") for name in names)
+        or (si_unit.startswith("rad/s") and "radian" not in powers and "second" in powers)
     ):
         raise ValueError("Hz and 1/s are ambiguous: turns or radians?")
+    # Pint treats angles, counts and bits as plain numbers, so that 1/deg has the dimension of rad.
+    # Their exponents are therefore compared too.
+    if si_unit in _OPTIONAL_ANGLE and powers.get("radian", 0) in (-1, 0):
+        powers["radian"] = si_powers.get("radian", 0)
+    if not has_same_dimension or any(
+        powers.get(name, 0) != si_powers.get(name, 0) for name in powers.keys() | si_powers
+    ):
+        raise ValueError(f"{unit!r} is not a unit of {quantity_name}, which is in {si_unit or 'no unit'}")
+    if si_unit == "degC":
+        # Pint cannot convert a difference of temperatures to a temperature.
+        if any(name.startswith("delta_") for name in names):
+            raise ValueError(f"{unit!r} is a difference of temperatures, must be a temperature")
+    elif zero != 0.0:
+        raise ValueError(f"{unit!r} is logarithmic, must be proportional to the quantity")
     return quantity.to(si_unit or "dimensionless").magnitude
 
 

@@ -87,6 +87,17 @@ class Proposal(NamedTuple):
     """Reason why nothing can be identified from these columns, with a remedy; None: no problem."""
 
 
+class _Header(NamedTuple):
+    """A column's name, and the units that the file states for it."""
+
+    name: str
+    """Name of the column in the file."""
+    bare_name: str
+    """Name without units."""
+    stated_units: tuple[str, ...]
+    """Texts of the stated units."""
+
+
 class _Entry(NamedTuple):
     """A signal of a proposed mapping."""
 
@@ -120,11 +131,12 @@ def propose_columns(path: Path | str) -> Proposal:
             *table.columns
         } - {name}:
             continue
-        signal, unit, doubt = _signal(name, table, entries)
+        header = _parse_header(name, table)
+        signal, unit, doubt = _signal(header, entries)
         if signal and not _finite_values(name, table).size:
             signal, doubt = None, "holds no numbers, left out"
         if signal:
-            entries[signal], doubt = _entry(signal, name, unit, table)
+            entries[signal], doubt = _entry(signal, header, unit, table)
         if signal and list_entry:
             entry_names = table.entries.get(
                 list_entry[1],
@@ -147,16 +159,18 @@ def propose_columns(path: Path | str) -> Proposal:
     return Proposal(columns, tuple(doubts), _problem(path.stem, table, entries))
 
 
-def _signal(name: str, table: Table, used: Collection[str]) -> tuple[str | None, str | None, str]:
+def _signal(header: _Header, used: Collection[str]) -> tuple[str | None, str | None, str]:
     """Return a column's signal, its stated unit, and the reason why it is left out.
 
     Signal and unit are None if they are unknown.
     """
-    stated, bare = _stated_units(name, table)
+    name, stated = header.name, header.stated_units
     # iMotor is split into words like i_motor, but a unit such as mA must not be split.
     words = [
         word
-        for word in re.split(r"[\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", bare).lower())
+        for word in re.split(
+            r"[\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", header.bare_name).lower()
+        )
         if word
     ]
     parts = [part for part in re.split(r"[\W_]+", name.lower() if name.isupper() else name) if part]
@@ -210,8 +224,8 @@ def _signal(name: str, table: Table, used: Collection[str]) -> tuple[str | None,
     return best, units[best], ""
 
 
-def _stated_units(name: str, table: Table) -> tuple[list[str], str]:
-    """Return the units that the file states for a column, as texts, and the name without them.
+def _parse_header(name: str, table: Table) -> _Header:
+    """Find the units that the file states for a column.
 
     The unit is in a separate line of the file, or in the name: in brackets, after "in", or as a
     sign at its end.
@@ -224,8 +238,8 @@ def _stated_units(name: str, table: Table) -> tuple[list[str], str]:
         bracket[1] if bracket else "",
         (suffix[1] or suffix[2]) if suffix else "",
     ]
-    units = [text.strip("[]() ") for text in texts if text]
-    return units, bare[: suffix.start()] if suffix else bare
+    units = tuple(text.strip("[]() ") for text in texts if text)
+    return _Header(name, bare[: suffix.start()] if suffix else bare, units)
 
 
 def _unit_factor(
@@ -277,14 +291,15 @@ def _valid_unit(signal: str, unit: str) -> str | None:
     return None
 
 
-def _entry(signal: str, name: str, unit: str | None, table: Table) -> tuple[_Entry, str]:
+def _entry(signal: str, header: _Header, unit: str | None, table: Table) -> tuple[_Entry, str]:
     """Return the mapping of a signal, and a doubt if its unit is not clearly stated."""
+    name = header.name
     bare = re.sub(r"\[0\]$", "", name)
     # In a formula, names that are not identifiers are quoted.
     is_identifier = bare.isascii() and bare.isidentifier() and not keyword.iskeyword(bare)
     formula = name if is_identifier else json.dumps(name, ensure_ascii=False)
     values, doubt = _finite_values(name, table), ""
-    factor, scaled_unit = _unit_factor(signal, _stated_units(name, table)[0])
+    factor, scaled_unit = _unit_factor(signal, header.stated_units)
     if scaled_unit:
         values, unit = values * float(factor), scaled_unit
         formula = f"{formula}*{factor}"

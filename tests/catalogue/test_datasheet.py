@@ -439,6 +439,31 @@ REFUSED = {
     "a decimal comma": ({"resistance": "0,46 ohm"}, "resistance", "0,46 ohm", "must be one number"),
     "turns or radians": ({"no_load_speed": "100 Hz"}, "no_load_speed", "100 Hz", "rpm"),
     "volts per hertz": ({"back_emf_constant": "0.4 V/Hz"}, "back_emf_constant", "0.4 V/Hz", "rpm"),
+    "an angle per angle": (
+        {"no_load_speed": "100 rad^2/s"},
+        "no_load_speed",
+        "'rad^2/s' is not a unit of this quantity, which is in rad/s",
+        'no_load_speed = "5310 rpm"',
+    ),
+    "a stiffness": (
+        {**CIM, "stall_torque": "2.42 N*m/deg"},
+        "stall_torque",
+        "'N*m/deg' is not a unit of this quantity, which is in N*m",
+        'stall_torque = "2.42 N*m"',
+    ),
+    "a ratio in degrees": (
+        {"gear_ratio": "30 deg"},
+        "gear_ratio",
+        "'deg' is not a unit of this quantity, which is in no unit",
+        'gear_ratio = "30"',
+    ),
+    "a loss in decibels": ({"gear_efficiency": "-3 dB"}, "'dB' is logarithmic", "gear_efficiency"),
+    "a difference of temperatures": (
+        {"max_winding_temperature": "100 delta_degC"},
+        "max_winding_temperature",
+        "'delta_degC' is a difference of temperatures, must be a temperature",
+        'max_winding_temperature = "125 degC"',
+    ),
     "gear of zero": ({"gear_ratio": 0}, "gear_ratio", "0", "> 0"),
     "negative": ({"resistance": "-1 ohm"}, "resistance", "-1 ohm", "> 0"),
     "not finite": ({"resistance": "1e999 ohm"}, "resistance", "1e999", "finite"),
@@ -517,6 +542,25 @@ def test_raises_with_field_value_and_remedy(case):
         from_datasheet(**printed)
     for word in words:
         assert word in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("unit", "kind", "size"),
+    [
+        # kT = kE, and J = torque/acceleration.
+        ("mV/rpm", "N*m/A", 0.06 / math.tau),
+        ("mV*s/rad", "N*m/A", 1e-3),
+        ("V*s", "V*s/rad", 1.0),
+        ("N*m*s^2/rad", "kg*m^2", 1.0),
+        ("N*m*s", "N*m*s/rad", 1.0),
+        ("mN*m/rpm", "N*m*s/rad", 0.06 / math.tau),
+        ("kg*cm/rpm", "N*m*s/rad", 0.0980665 * 60.0 / math.tau),
+        ("turn/min/V", "rad/s/V", math.tau / 60.0),
+        ("degC/W", "K/W", 1.0),
+    ],
+)
+def test_a_division_by_an_angle_is_optional_where_it_is_not_printed(unit, kind, size):
+    assert units.to_si(3.0, unit, kind, weights=True) == pytest.approx(3.0 * size, rel=1e-12)
 
 
 def test_contradictions_are_only_listed_if_not_strict():

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from codrl_mj.identify import propose_columns, read_log
+from codrl_mj.identify import proposal, propose_columns, read_log
 from codrl_mj.identify.columns import parse_columns, sign_magnitude, twos_complement
 
 TABLE = {
@@ -93,6 +93,29 @@ def test_mappings_are_equivalent_to_text():
         ("time=t:s,current=a:blub", "blub"),
         ("time=t:s,velocity=a:Hz", "rad/s"),
         ("time=t:s,velocity=a:1/s", "turns or radians"),
+        ("time=t:s,velocity=a:deg", "'deg' is not a unit of velocity, which is in rad/s"),
+        ("time=t:s,position=a:1/deg", "position=a:1/deg: '1/deg' is not a unit of position"),
+        ("time=t:s,position=a:deg**2", "'deg**2' is not a unit of position, which is in rad"),
+        ("time=t:s,position=a:percent", "not a unit of position, which is in rad; write rad, or"),
+        ("time=t:s,position=a:count", "'count' is not a unit of position"),
+        ("time=t:s/rad,current=a:A", "time=t:s/rad: 's/rad' is not a unit of time"),
+        ("time=t:s,voltage=a:V/deg", "'V/deg' is not a unit of voltage"),
+        ("time=t:s,bus=a:deg*V", "'deg*V' is not a unit of bus"),
+        ("time=t:s,current=a:A/turn", "'A/turn' is not a unit of current"),
+        ("time=t:s,torque=a:N*m/deg", "'N*m/deg' is not a unit of torque, which is in N*m"),
+        ("time=t:s,velocity=a:rad**2/s", "'rad**2/s' is not a unit of velocity"),
+        ("time=t:s,duty=a:1/deg", "'1/deg' is not a unit of duty, which is in no unit; write 1"),
+        ("time=t:s,duty=a:deg", "'deg' is not a unit of duty"),
+        ("time=t:s,duty=a:count", "'count' is not a unit of duty"),
+        ("time=t:s,duty=a:dB", "duty=a:dB: 'dB' is logarithmic, must be proportional"),
+        ("time=t:s,only=a:deg", "'deg' is not a unit of only"),
+        (
+            "time=t:s,temperature=a:delta_degC",
+            "temperature=a:delta_degC: 'delta_degC' is a difference of temperatures, must be a"
+            " temperature; write degC",
+        ),
+        ("time=t:s,temperature=a:K/W", "'K/W' is not a unit of temperature, which is in degC"),
+        ("time=t:s,command=a:V**1000", "the unit 'V**1000' is not known"),
         ("time=t:s,currant=a:A", "did you mean current"),
         ("time=t:s,current=a:A,current=b:A", "twice"),
         ("time=t:s,current=a:A:V", "two colons"),
@@ -203,6 +226,20 @@ SI = {
     "torque": "N*m",
 }
 SI |= {"duty": "1", "command": "rad", "temperature": "degC"}
+
+
+def test_each_header_is_parsed_once(tmp_path, monkeypatch):
+    names = []
+
+    def parse_header(name, table, original=proposal._parse_header):
+        names.append(name)
+        return original(name, table)
+
+    monkeypatch.setattr(proposal, "_parse_header", parse_header)
+    (tmp_path / "log.csv").write_text("t [s],pos [0.1 deg],i (mA)\n0,1,2\n1,2,3")
+    columns = 'time="t [s]":s,position="pos [0.1 deg]"*0.1:deg,current="i (mA)":mA'
+    assert propose_columns(tmp_path / "log.csv").columns == columns
+    assert names == ["t [s]", "pos [0.1 deg]", "i (mA)"]
 
 
 def test_raises_if_no_column_is_the_time(tmp_path):
