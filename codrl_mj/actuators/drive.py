@@ -379,10 +379,18 @@ class Drive(ActuatorModel):
             f" which the back-EMF of a saturated motor changes it by {share:.3g} times its value"
         )
         if share >= 2.0:
+            remedies = [remedy, f"set motor.rotor_inertia (total now {inertia:.3g} kg*m^2)"]
+            if rotor == 0.0:
+                remedies = [
+                    f"the motor moves only the load, {inertia:.3g} kg*m^2 at its shaft: set"
+                    " motor.rotor_inertia > 0, from the motor's datasheet",
+                    remedy,
+                ]
+            if remedy != "shorten the step":
+                remedies.append("shorten the step")
             raise UnstableError(
-                f"{text}, must be < 2; {remedy}, set motor.rotor_inertia (total now"
-                f" {inertia:.3g} kg*m^2), shorten the step, or pass allow_unstable=True to study it"
-                " as it is"
+                f"{text}, must be < 2; {', '.join(remedies)}, or pass allow_unstable=True to study"
+                " it as it is"
             )
         if share > 0.5:
             warnings.warn(

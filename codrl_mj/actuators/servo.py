@@ -348,8 +348,15 @@ class Servo(Drive):
     def loop_remedy(self, inertia: float) -> str:
         """Return a remedy for the outer loops' gains; see `ActuatorModel.loop_remedy`."""
         loop, at_joint = self.loop, inertia * self.motor.gear_ratio**2
+        cause = f"The inertia at the joint is {at_joint:.3g} kg*m^2."
+        if self.motor.rotor_inertia == 0.0:
+            cause = (
+                f"motor.rotor_inertia = 0: the loops move only the load, {at_joint:.3g} kg*m^2 at"
+                " the joint; must be > 0 if the load is light: set it to the rotor's, from the"
+                " motor's datasheet."
+            )
         return (
-            f"The inertia at the joint is {at_joint:.3g} kg*m^2. For a bandwidth f, set"
+            f"{cause} For a bandwidth f, set"
             f" loop.velocity_gain (now {loop.velocity_gain:g}) to 2*pi*f times this inertia, with f"
             f" well below servo_rate = {loop.servo_rate:g} Hz; and set position_gain (now"
             f" {loop.position_gain:g}) well below 2*pi*f."

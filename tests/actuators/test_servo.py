@@ -200,6 +200,38 @@ def test_raises_if_a_servo_cannot_work(change, message):
         run_servo(servo(**{"velocity_gain": 1.5, **change}), [])
 
 
+@pytest.mark.filterwarnings("ignore:motor.rotor_inertia = 0")
+@pytest.mark.parametrize("controls", ["position", "velocity"])
+@pytest.mark.parametrize(
+    ("mass", "message"),
+    [
+        # The inertia of the sphere is 2/5*m*r^2.
+        (
+            1e-3,
+            r"^m: the outer loops are unstable: .* must be < 1\. motor\.rotor_inertia = 0: the loops"
+            r" move only the load, 4e-08 kg\*m\^2 at the joint; must be > 0 if the load is light: set"
+            r" it to the rotor's, from the motor's datasheet",
+        ),
+        (
+            1e-5,
+            r"^m: motor\.rotor_inertia = 0: .* must be < 2; the motor moves only the load, 4e-10"
+            r" kg\*m\^2 at its shaft: set motor\.rotor_inertia > 0, from the motor's datasheet",
+        ),
+    ],
+)
+def test_raises_and_names_a_rotor_without_inertia_as_the_cause(controls, mass, message):
+    spec = mujoco.MjSpec.from_string(
+        f"""<mujoco><worldbody><body><joint name="j" axis="0 0 1"/>
+        <geom size=".01" mass="{mass}"/></body></worldbody>
+        <actuator><motor name="m" joint="j"/></actuator></mujoco>"""
+    )
+    loop = ServoLoop(controls=controls, velocity_gain=1e-3)
+    with pytest.raises(UnstableError, match=message):
+        codrl_mj.add_motors(spec, {"m": Servo(GearMotor(rotor_inertia=0.0), loop=loop)})
+    # The default motor's rotor of 4e-6 kg*m^2 is enough for these gains.
+    codrl_mj.add_motors(spec, {"m": Servo(GearMotor(), loop=loop)})
+
+
 def growth(model, steps=1500):
     """Return the growth of a disturbance at rest without gravity, as a ratio of largest speeds."""
     data, speeds = mujoco.MjData(model), []
