@@ -3,8 +3,10 @@
 import functools
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco.reacher_v5 import ReacherEnv
 
 import codrl_mj
 from codrl_mj.actuators import Lag
@@ -43,8 +45,15 @@ REACHER = {".*": "lag"}
             (functools.partial(gym.make, "Reacher-v5"), "lag"),
             lambda: codrl_mj.make("Reacher-v5", "lag"),
         ),
+        (
+            (lambda **options: gym.make("Reacher-v5", **options), "lag"),
+            lambda: codrl_mj.make("Reacher-v5", "lag"),
+        ),
     ],
-    ids=["task", "id", "configuration", "without motors", "one for all", "by pattern", "function"],
+    ids=[
+        *("task", "id", "configuration", "without motors", "one for all", "by pattern"),
+        *("function", "lambda"),
+    ],
 )
 def test_make_accepts_a_name_an_id_a_configuration_and_a_function(arguments, make_expected):
     np.testing.assert_array_equal(
@@ -141,3 +150,53 @@ def test_arguments_replace_fields_of_a_configuration(view):
 def test_raises_and_names_what_is_unknown(factory, arguments, message):
     with pytest.raises((ValueError, gym.error.Error), match=message):
         factory(*arguments)
+
+
+class Robot:
+    """Class without an environment's interface."""
+
+
+class HiddenRobot(gym.Env):
+    """Environment that hides its model."""
+
+    def __init__(self):
+        """Build the model of an environment inside."""
+        self.observation_space = self.action_space = gym.spaces.Box(-1.0, 1.0, (2,))
+        self._inner = gym.make("Reacher-v5")
+
+
+def needs_scale(scale):
+    return gym.make("Reacher-v5", frame_skip=scale)
+
+
+REACHER_ENV = gym.make("Reacher-v5")
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (lambda: None, "env = lambda: made None, must make a gymnasium.Env; return the env"),
+        (lambda: ReacherEnv, r"must make a gymnasium.Env; return an instance, ReacherEnv\(\), or"),
+        (lambda: Robot(), r"env = lambda: made .*; derive Robot from gymnasium.Env"),
+        (Robot, "env = Robot: made .*; derive Robot from gymnasium.Env"),
+        (lambda: pendulum, "must make a gymnasium.Env; pass that function itself"),
+        (lambda: gym.make_vec("Reacher-v5", 1), "make several with codrl_mj.make_vec"),
+        (lambda: mujoco.MjSpec(), "add motors to a MjSpec with codrl_mj.add_motors"),
+        (lambda: codrl_mj.make("Reacher-v5", "lag"), "which has motors already; pass its name"),
+        (lambda: codrl_mj.make("pendulum"), "which has motors already; pass its name"),
+        (lambda: gym.make("Pendulum-v1"), "env = lambda: the environment has no MuJoCo model bu"),
+        (lambda: REACHER_ENV, "that build such a model while they are made can get motors"),
+        (HiddenRobot, "env = HiddenRobot: must have MuJoCo's model and data as attributes; name"),
+        (needs_scale, r"env = needs_scale: cannot be called with the arguments \{\}: .*'scale'"),
+        (REACHER_ENV, "must be an id, or a function .*; pass a function instead"),
+        (None, "env = None: must be an id, or a function or class that makes an environment"),
+    ],
+)
+def test_raises_if_a_function_makes_no_environment_with_a_model(env, message):
+    with pytest.raises(ValueError, match=message):
+        codrl_mj.make(env, "lag")
+
+
+def test_raises_if_a_function_does_not_take_an_argument():
+    with pytest.raises(ValueError, match=r"env = lambda: cannot be called .*'render_mode'"):
+        codrl_mj.make(lambda: gym.make("Reacher-v5"), "lag", render_mode="rgb_array")

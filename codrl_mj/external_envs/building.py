@@ -94,20 +94,22 @@ class ModelPatcher:
             warnings.filterwarnings("ignore", category=UserWarning, module=own_modules)
             return add_motors(read_spec(), matching, *self._add_motors_arguments).compile()
 
-    def check(self, env_id: str = "") -> None:
+    def check(self, env_id: str = "", label: str = "") -> None:
         """Raise if a pattern matched nothing, or if no model was built from XML.
 
-        `env_id` is the id of a Gymnasium environment, for the message.
+        `env_id` is the id of a Gymnasium environment, and `label` a prefix, for the message.
         """
         if not self._names_of_models and env_id:
             task = next((task.name for task in TASKS.values() if task.gymnasium_id == env_id), None)
             remedy = (
                 f"use this package's task {task!r}, which has motors"
                 if task
-                else "only environments with such a model can get motors"
+                else "only environments that build such a model while they are made can get motors;"
+                " add motors to the MjSpec of any other model with codrl_mj.add_motors"
             )
             raise ValueError(
-                f"the environment has no MuJoCo model built from XML, and so no motors: {remedy}"
+                f"{label}the environment has no MuJoCo model built from XML, and so no motors:"
+                f" {remedy}"
             )
         if not self._names_of_models:
             raise ValueError(

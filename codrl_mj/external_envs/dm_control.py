@@ -41,6 +41,12 @@ class MotorsAddedEnvironment(dm_env.Environment):
         )
         with self._patcher.patch_model_loading():
             self._environment = build()
+        if not isinstance(self._environment, dm_env.Environment):
+            raise ValueError(
+                f"environment: the function made {self._environment!r}, must make a"
+                " dm_env.Environment; return one at its end, or use codrl_mj.make for an"
+                " environment of Gymnasium"
+            )
         self._patcher.check()
         # Compared by name, because dm_control.composer may not be imported.
         classes = type(self._environment).__mro__
@@ -207,6 +213,12 @@ def make_dm_control(
         allow_unstable,
         joint_dynamics,
     )
+    if not isinstance(environment, str) and not callable(environment):
+        raise ValueError(
+            f"environment = {environment!r}: must be DOMAIN/TASK, or a function that makes an"
+            " environment; pass a function instead of an environment, such as lambda:"
+            " suite.load(DOMAIN, TASK)"
+        )
     if not isinstance(environment, str):
         return MotorsAddedEnvironment(lambda: environment(**options), settings, noise_seed)
     domain, _, task = environment.partition("/")

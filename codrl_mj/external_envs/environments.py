@@ -3,6 +3,8 @@
 import copy
 import dataclasses
 import functools
+import inspect
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,6 +14,7 @@ import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorEnv
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.disturbances import NO_DISTURBANCES, resolve
@@ -80,10 +83,13 @@ def make(
         entry = gymnasium.spec(env_id)
     elif not callable(env_id):
         raise ValueError(
-            f"env_id = {env_id!r}: must be an id, or a function or class that makes an environment"
+            f"env = {env_id!r}: must be an id, or a function or class that makes an environment;"
+            " pass a function instead of an environment, such as lambda: gymnasium.make(ID)"
         )
     else:
-        entry = EnvSpec(getattr(env_id, "__name__", "environment"), env_id)
+        # Gymnasium accepts few characters in an id, and not those of <lambda>.
+        name = re.sub(r"[^\w:.-]", "", str(getattr(env_id, "__name__", "")))
+        entry = EnvSpec(name or "environment", env_id)
         env_id = entry.id
     if str(entry.entry_point).startswith("codrl_mj.envs:"):
         raise ValueError(
@@ -130,9 +136,14 @@ class MotorsAddedCreator:
         patcher = ModelPatcher(
             settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action
         )
+        # An error of a registered id names the id already.
+        is_function = self.env_id.rpartition(":")[2] not in gymnasium.registry
+        if is_function:
+            _check_arguments(self.creator, options, self.env_id)
         with patcher.patch_model_loading():
             env = self.creator(**options)
-        patcher.check(self.env_id)
+        _check_env(env, self.env_id)
+        patcher.check(self.env_id, f"env = {self.env_id}: " if is_function else "")
         base: Any = env.unwrapped
         env_class: Any = type(base)
         # The class of the existing object is replaced, because only the original creator, which may
@@ -147,6 +158,53 @@ class MotorsAddedCreator:
     def make_unwrapped(self, **options: Any) -> gymnasium.Env:
         """Make the environment, without wrappers."""
         return self(**options).unwrapped
+
+
+def _check_arguments(creator: Any, options: Mapping[str, Any], name: str) -> None:
+    """Raise ValueError if a function cannot be called with these options."""
+    try:
+        signature = inspect.signature(creator)
+    # Some functions in C have no signature.
+    except ValueError:
+        return
+    try:
+        signature.bind(**options)
+    except TypeError as error:
+        raise ValueError(
+            f"env = {name}: cannot be called with the arguments {dict(options)}: {error}; pass what"
+            f" it needs to make, and let it accept the rest, as in lambda **options:"
+            " gymnasium.make(ID, **options)"
+        ) from None
+
+
+def _check_env(env: Any, name: str) -> None:
+    """Raise ValueError if the result of a creator cannot get motors."""
+    if isinstance(env, gymnasium.Env):
+        layers = [env]
+        while isinstance(layers[-1], gymnasium.Wrapper):
+            layers.append(layers[-1].env)
+        if any(type(layer).__module__.startswith("codrl_mj.") for layer in layers):
+            raise ValueError(
+                f"env = {name}: made {env}, which has motors already; pass its name or"
+                " configuration, and the actuator, to make instead of the function"
+            )
+        return
+    modules = {base.__module__.partition(".")[0] for base in type(env).__mro__}
+    if env is None:
+        remedy = "return the environment at its end"
+    elif isinstance(env, type):
+        remedy = f"return an instance, {env.__name__}(), or pass the class itself"
+    elif isinstance(env, VectorEnv):
+        remedy = "return a single environment, and make several with codrl_mj.make_vec"
+    elif isinstance(env, mujoco.MjModel | mujoco.MjSpec):
+        remedy = "add motors to a MjSpec with codrl_mj.add_motors"
+    elif "dm_env" in modules:
+        remedy = "use codrl_mj.make_dm_control"
+    elif callable(env):
+        remedy = "pass that function itself"
+    else:
+        remedy = f"derive {type(env).__name__} from gymnasium.Env"
+    raise ValueError(f"env = {name}: made {env!r}, must make a gymnasium.Env; {remedy}")
 
 
 @functools.cache
@@ -194,8 +252,9 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             base, "data"
         ):
             raise ValueError(
-                f"{name}: has no MuJoCo model and data as attributes: build it in a block of"
-                " codrl_mj.motors_added, and read the motors with codrl_mj.signals"
+                f"env = {name}: must have MuJoCo's model and data as attributes; name them so, or"
+                " build it in a block of codrl_mj.motors_added, and read the motors with"
+                " codrl_mj.signals"
             )
         assert base.spec is not None
         self._settings: MotorSettings = base.spec.entry_point.settings  # type: ignore[union-attr]

@@ -1,5 +1,6 @@
 """`make_dm_control`: dm_control's environments with motors."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from dm_control import composer, manipulation, suite
@@ -190,6 +191,9 @@ def test_commands_are_delayed_by_whole_environment_steps():
     [
         ("cheetah/rn", IDEAL, r"environment = 'cheetah/rn': did you mean 'cheetah/run'\?"),
         ("cheetah/run", {"knee": "lag"}, r"'knee': no actuator has such a name.*bthigh"),
+        (None, IDEAL, "environment = None: must be DOMAIN/TASK, or a function .*; pass a function"),
+        (lambda: None, IDEAL, "environment: the function made None, must make a dm_env.Environ"),
+        (lambda: gym.make("Reacher-v5"), IDEAL, "or use codrl_mj.make for an environment of Gymn"),
     ],
 )
 def test_raises_for_wrong_arguments(environment, actuators, message):
