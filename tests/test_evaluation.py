@@ -30,6 +30,7 @@ from codrl_mj.fields import real
 from codrl_mj.physics import trace_names
 from codrl_mj.tasks import TASKS, named_actuator
 from codrl_mj.viz.films import strip
+from codrl_mj.viz.films.film import record
 from codrl_mj.viz.pages.episode import RunEpisode, _motor_plots, _motor_series
 
 TRACE = trace_names(DCMotorActuator)
@@ -536,10 +537,15 @@ def test_a_policy_is_not_measured_where_its_observations_or_actions_are_others()
     policy.action_space = EnvConfig("pendulum", action="voltage").make().action_space
     with pytest.raises(
         ValueError,
-        match=r"action_space: the policy was trained with Box.*but pendulum now has",
+        match=r"action_space: the policy was trained with Box.*but the environment has",
     ):
         evaluate(policy, EnvConfig("pendulum"), episodes=1)
     policy.action_space = None
     policy.observation_space = EnvConfig("cartpole").make().observation_space
-    with pytest.raises(ValueError, match=r"observation_space: the policy was trained with Box"):
-        evaluate(policy, EnvConfig("pendulum"), episodes=1)
+    for run in (
+        lambda env: evaluate(policy, env, episodes=1),
+        lambda env: run_episodes(policy, env.make, 1),
+        lambda env: record(policy, env, 0, 64, 48),
+    ):
+        with pytest.raises(ValueError, match=r"observation_space: the policy was trained with Box"):
+            run(EnvConfig("pendulum"))

@@ -29,15 +29,9 @@ class Subject:
     """Run folder of the training; None if there is none."""
 
     def check_interface(self, env: EnvConfig) -> None:
-        """Raise ValueError if an environment has other observations or commands than the policy."""
-        if self.run is None:
-            from codrl_mj.runs.policies import check_spaces
-
-            # The task sets the bounds of forces. The bounds of other commands depend on the motor,
-            # and an evaluation may use another motor on purpose.
-            check_spaces(self.policy, env, exact=env.action == "force")
+        """Raise ValueError if the policy has other observations or commands in an environment."""
         # A run folder stores these settings, so every difference is an error. Without one only the
-        # spaces can be compared.
+        # spaces can be compared, which `run_episodes` does.
         for name, trained in self.env.policy_fields.items() if self.run is not None else ():
             if (value := env.policy_fields[name]) != trained:
                 flag = f"--env.{name.replace('_', '-')}"

@@ -207,11 +207,12 @@ class Contract(Interface):
             double: True if the C code computes in double, False for float.
 
         Raises:
-            ValueError: the policy cannot be exported, `episodes` is below 1, or a limit is unknown
-                or not positive.
+            ValueError: the policy cannot be exported or was trained with other observations or
+                actions, `episodes` is below 1, or a limit is unknown or not positive.
         """
         network = extract_network(policy)
-        golden_episodes = run_episodes(policy, env.make, episodes, seed)
+        # The bounds of the actions scale the exported commands.
+        golden_episodes = run_episodes(policy, env.make, episodes, seed, same_bounds=True)
         # A policy that fails at once has short episodes.
         while sum(len(episode.time) for episode in golden_episodes) < NUM_GOLDEN:
             golden_episodes += run_episodes(policy, env.make, episodes, seed + len(golden_episodes))

@@ -13,7 +13,7 @@ from codrl_mj.deploy.network import Network, extract_network
 from codrl_mj.deploy.tiles import Tiles
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.files import atomic_folder
-from codrl_mj.runs.policies import Policy, check_spaces
+from codrl_mj.runs.policies import Policy
 
 ONNX, TABLE = "policy.onnx", "table.csv"
 OPSET = 17
@@ -125,7 +125,6 @@ def export(
         raise FileExistsError(
             f"--out {out}: it exists and is not an empty folder: name another, or delete it"
         )
-    check_spaces(policy, env)
     network = extract_network(policy)
     if board is not None:
         check_board(board, network, double)

@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import dataclasses
+import itertools
 import json
 import zipfile
 import zlib
@@ -18,7 +19,7 @@ from codrl_mj.actuators import IDEAL, actuator_from_mapping, allow_imports, mapp
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import check_memory
 from codrl_mj.runs.files import atomic_write, select_prefix
-from codrl_mj.runs.policies import Policy
+from codrl_mj.runs.policies import Policy, check_spaces
 
 MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
 
@@ -272,6 +273,18 @@ class _Recording:
         )
 
 
+def check_policy(policy: Any, env: Any, same_bounds: bool = False) -> None:
+    """Raise ValueError if a policy was trained with other observations or actions.
+
+    A space that the policy does not have is not compared. Other bounds of currents or voltages
+    cause a warning, or with `same_bounds` an error too.
+    """
+    # The task defines the bounds of forces. The bounds of other commands depend on the motor, and
+    # a policy may be tested on another motor on purpose.
+    is_force = env.get_wrapper_attr("recorder").command == "force"
+    check_spaces(policy, env, exact=same_bounds or is_force)
+
+
 def run_episodes(
     policy: Policy,
     make: MakeEnv,
@@ -279,6 +292,7 @@ def run_episodes(
     seed: int = 0,
     deterministic: bool = True,
     on_step: Callable[[int, int], None] | None = None,
+    same_bounds: bool = False,
 ) -> list[Episode]:
     """Run whole episodes side by side, with one call of the policy per step for all of them.
 
@@ -289,18 +303,28 @@ def run_episodes(
         seed: first seed, and seed of torch's generator for sampled actions.
         deterministic: True for the most likely action, False for a sampled one.
         on_step: called with (episodes running, episodes finished) after every step.
+        same_bounds: True to raise, instead of warning, if currents or voltages only have other
+            bounds than in the policy's training.
 
     Returns:
         The episodes, in the order of their seeds.
 
     Raises:
-        ValueError: `episodes` is below 1, or `seed` below 0.
+        ValueError: `episodes` is below 1, or `seed` below 0; or the policy was trained with other
+            observations or actions.
         SimulationDivergedError: a simulation has a value that is not finite.
     """
     check_episodes(episodes)
     if seed < 0:
         raise ValueError(f"seed = {seed}: must be >= 0")
-    recordings = [_Recording(make(), seed + index) for index in range(episodes)]
+    env = make()
+    try:
+        check_policy(policy, env, same_bounds)
+    except ValueError:
+        env.close()
+        raise
+    envs = itertools.chain([env], (make() for _ in range(episodes - 1)))
+    recordings = [_Recording(env, seed + index) for index, env in enumerate(envs)]
     running = recordings
     with contextlib.ExitStack() as stack:
         # Stochastic policies sample from torch's global generator, whose state is restored

@@ -4,7 +4,6 @@
 `load_sb3_zip` unpickles, and requires `trust`.
 """
 
-import contextlib
 import hashlib
 import pickle
 import warnings
@@ -16,7 +15,6 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import allow_imports
 from codrl_mj.agents import AgentConfig, agent_from_mapping
-from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs import DESCRIPTION, DIGEST, WEIGHTS
 from codrl_mj.runs.files import atomic_write, check_digest, read_json, with_digest, write_json
 
@@ -275,22 +273,17 @@ def _check_normalization(path: Path, model: Any) -> None:
         )
 
 
-def check_spaces(policy: Any, env: EnvConfig, exact: bool = True) -> None:
+def check_spaces(policy: Any, env: Any, exact: bool = True) -> None:
     """Raise if the spaces of an environment differ from those of a policy's training.
 
     A space that the policy does not have is not compared. If `exact` is False, a difference
     in nothing but the bounds of the actions causes a warning instead of an error.
     """
-    if all(getattr(policy, name, None) is None for name in ("observation_space", "action_space")):
-        return
-    with contextlib.closing(env.make()) as opened_env:
-        env_spaces = {
-            name: getattr(opened_env, name) for name in ("observation_space", "action_space")
-        }
-    for name, space in env_spaces.items():
-        if (trained := getattr(policy, name, None)) is None or _is_same(trained, space):
+    for name in ("observation_space", "action_space"):
+        trained, space = getattr(policy, name, None), getattr(env, name)
+        if trained is None or _is_same(trained, space):
             continue
-        text = f"{name}: the policy was trained with {trained}, but {env.task} now has {space}"
+        text = f"{name}: the policy was trained with {trained}, but the environment has {space}"
         frames = np.prod(trained.shape or (1,)) / np.prod(space.shape or (1,))
         if name == "observation_space" and frames > 1 and frames % 1 == 0:
             text += (
@@ -303,7 +296,7 @@ def check_spaces(policy: Any, env: EnvConfig, exact: bool = True) -> None:
         )
         if exact or name != "action_space" or not _is_same(trained, space, bounds=False):
             raise ValueError(text)
-        warnings.warn(text, stacklevel=2)
+        warnings.warn(text, stacklevel=4)
 
 
 def _is_same(space: Any, other_space: Any, bounds: bool = True) -> bool:

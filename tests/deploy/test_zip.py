@@ -288,13 +288,19 @@ def volts(tmp_path_factory):
 
 def test_volts_are_not_exported_as_torques(volts, tmp_path, capsys):
     path, motor = str(volts / "policy.zip"), str(volts / "apart/motor.yaml")
-    for verb in (["evaluate", path, *ZIP, "--episodes", "1"], ["export", path, *ZIP]):
+    for verb in (
+        ["evaluate", path, *ZIP, "--episodes", "1"],
+        ["render", path, *ZIP, "--out", "film.gif"],
+        ["replay", path, *ZIP],
+        ["view", path, *ZIP],
+        ["export", path, *ZIP],
+    ):
         assert main(verb) == 2
         error = capsys.readouterr().err
         assert "action_space: the policy was trained with Box(-12.0, 12.0, (1,), float32)" in error
         assert (
-            "but pendulum now has Box(-2.0, 2.0, (1,), float32): repeat the settings of its training"
-            in error
+            "but the environment has Box(-2.0, 2.0, (1,), float32): repeat the settings of its"
+            " training" in error
         )
         assert "--env.action" in error
     # The task's default motor has other voltages.
@@ -315,6 +321,31 @@ def test_volts_are_not_exported_as_torques(volts, tmp_path, capsys):
             "ppo",
             tmp_path / "other",
         )
+
+
+def test_a_contract_needs_the_bounds_of_the_training(volts):
+    policy = load_sb3_zip(volts / "policy.zip", "ppo", True)
+    with pytest.raises(ValueError, match=r"Box\(-12\.0, 12\.0.*but the environment has Box\(-24\."):
+        Contract.from_policy(policy, EnvConfig("pendulum", action="voltage"), "ppo", episodes=1)
+
+
+def test_an_evaluation_makes_only_the_environments_of_its_episodes(volts, capsys, monkeypatch):
+    configs = []
+
+    def make(config, original=EnvConfig.make, **options):
+        configs.append(config)
+        return original(config, **options)
+
+    monkeypatch.setattr(EnvConfig, "make", make)
+    line = ["evaluate", str(volts / "policy.zip"), *ZIP, "--episodes", "2"]
+    assert (
+        main([*line, "--env.action", "voltage", "--actuator", str(volts / "apart/motor.yaml")]) == 0
+    )
+    assert len(configs) == 2
+    # The first environment shows that the others would not fit either.
+    assert main(line) == 2
+    assert "action_space: the policy was trained with Box(-12.0" in capsys.readouterr().err
+    assert len(configs) == 3
 
 
 @pytest.mark.filterwarnings("default::UserWarning")

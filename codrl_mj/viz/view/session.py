@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import override_actuator
-from codrl_mj.evaluation import RandomPolicy
+from codrl_mj.evaluation import RandomPolicy, check_policy
 from codrl_mj.fields import field_docs, nested_types
 
 _NO_LIMIT = 10**9  # environment steps
@@ -225,6 +225,7 @@ class Session:
         """
         policy = self.policies[name]()
         try:
+            check_policy(policy, self.env)
             space = self.env.observation_space
             action, _ = policy.predict(np.zeros((1, *space.shape), space.dtype), deterministic=True)
             fits = self.env.action_space.contains(
