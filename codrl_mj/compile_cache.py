@@ -155,10 +155,8 @@ class _FunctionCache(_Cache):  # type: ignore[misc]
     """Cache of one function's overloads, one for each signature, with the interface of numba."""
 
     def __init__(self, kind: str, function: Any, options: Any) -> None:
-        self._name, self._key_values = (
-            function.__name__,
-            (kind, tuple(sorted(options.items())), function),
-        )
+        self._name = function.__name__
+        self._key_values = (kind, tuple(sorted(options.items())), function)
 
     @property
     def cache_path(self) -> str:
@@ -388,11 +386,9 @@ def _hash_value(key: Any, value: Any, names: tuple[str, ...], visited: dict[int,
 
 def _hash_function(key: Any, function: Any, visited: dict[int, Any]) -> None:
     """Hash a function's name and, outside `_VERSIONED_PACKAGES`, its code and all it refers to."""
-    code, scope, root = (
-        function.__code__,
-        function.__globals__,
-        str(function.__module__).partition(".")[0],
-    )
+    code = function.__code__
+    scope = function.__globals__
+    root = str(function.__module__).partition(".")[0]
     key.update(f"function {function.__module__}.{function.__qualname__}\n".encode())
     if root not in (*_VERSIONED_PACKAGES, "codrl_mj"):
         key.update(hashlib.sha256(_source_of(function.__module__)).digest())

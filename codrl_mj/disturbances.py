@@ -128,10 +128,8 @@ def check_delay(disturbances: Disturbances, step_duration: float, max_steps: int
         step_duration: duration of an environment step [s].
         max_steps: length of the longest episode [environment steps]; None if unknown.
     """
-    delay, episode = (
-        disturbances.command_delay,
-        math.inf if max_steps is None else max_steps * step_duration,
-    )
+    delay = disturbances.command_delay
+    episode = math.inf if max_steps is None else max_steps * step_duration
     text = f"Disturbances.command_delay = {delay:g}: "
     remedy = f"it is in seconds: for {delay:g} ms write {delay / 1e3:g}"
     if delay >= episode:

@@ -154,10 +154,8 @@ def read_text(path: Path) -> str:
             .replace("\r", "\n")
         )
     except UnicodeDecodeError as error:
-        line, byte = (
-            content.count(b"\n", 0, error.start) + 1,
-            content[error.start : error.start + 1],
-        )
+        line = content.count(b"\n", 0, error.start) + 1
+        byte = content[error.start : error.start + 1]
         character = byte.decode("cp1252", "replace")
         raise ValueError(
             f"line {line} has the byte 0x{byte.hex()} ({character} in Windows-1252), which is not"

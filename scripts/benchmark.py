@@ -344,10 +344,8 @@ def publish(
     rows = [row for row in read_csv(file) if row["group"] not in results]
     for group, members in results.items():
         for name, spreads in members.items():
-            speed, ratio = (
-                spreads["steps_per_second"][0],
-                [f"{value:.3f}" for value in spreads["ratio"]],
-            )
+            speed = spreads["steps_per_second"][0]
+            ratio = [f"{value:.3f}" for value in spreads["ratio"]]
             row = {"group": group, "member": name, "steps_a_second": f"{speed:.0f}"}
             rows.append(row | dict(zip(("ratio", "least", "most"), ratio, strict=True)))
     write_csv(file, rows)

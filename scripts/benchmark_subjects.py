@@ -233,11 +233,9 @@ def raw_batch(task: str, num_envs: int, threads: int, calls_apart: bool) -> Subj
     env.reset(seed=0)
     env.step(np.zeros(env.action_space.shape, env.action_space.dtype))
     physics = env.unwrapped.physics
-    batch, start, inner_steps = (
-        Batch(physics.model, num_envs, threads),
-        physics.snapshot(),
-        physics.simulation.inner_steps,
-    )
+    batch = Batch(physics.model, num_envs, threads)
+    start = physics.snapshot()
+    inner_steps = physics.simulation.inner_steps
 
     def prepare() -> None:
         install_callbacks(physics.model)

@@ -28,10 +28,8 @@ import gymnasium
 import numpy as np
 
 ROWS = Path(__file__).parents[1] / "docs" / "results" / "training_speed.csv"
-PAGE, WRITTEN = (
-    ROWS.parents[1] / "training_speed.md",
-    "<!-- written by scripts/benchmark_training.py -->",
-)
+PAGE = ROWS.parents[1] / "training_speed.md"
+WRITTEN = "<!-- written by scripts/benchmark_training.py -->"
 COLUMNS = (
     "task",
     "contender",
@@ -336,10 +334,8 @@ def with_envpool(task: str, seed: int, watch: Watch) -> None:
                         torch.as_tensor(ended),
                     )
                 )
-                observation, is_reset = (
-                    torch.as_tensor(next_observation, dtype=torch.float32),
-                    torch.as_tensor(ended),
-                )
+                observation = torch.as_tensor(next_observation, dtype=torch.float32)
+                is_reset = torch.as_tensor(ended)
             steps += count * length
             states, actions, log_probs, rewards, is_reset_step, is_terminal, is_last = map(
                 torch.stack, zip(*rollout, strict=True)

@@ -295,10 +295,8 @@ class Outcome:
     @property
     def failures(self) -> list[str]:
         """Descriptions of everything that is wrong with the result."""
-        allowed, has_message = (
-            ((130,) if self.interrupted else (0, 1, 2)),
-            "codrl-mj: " in self.output,
-        )
+        allowed = (130,) if self.interrupted else (0, 1, 2)
+        has_message = "codrl-mj: " in self.output
         problems = [] if self.status in allowed else [f"exit status {self.status}"]
         if "Traceback (most recent call last)" in self.output:
             problems.append("traceback")

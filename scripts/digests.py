@@ -174,10 +174,8 @@ def variants(task: str, physics: str) -> Iterator[tuple[str, dict[str, Any]]]:
     for actuator in ACTUATORS:
         yield actuator, {"actuator": actuator}
         for name in DISTURBANCES if actuator in ("ideal", "paper") else ():
-            is_motor_disturbance, is_joint_disturbance = (
-                name in LOW_VOLTAGE or name in _MOTOR,
-                name in _JOINT,
-            )
+            is_motor_disturbance = name in LOW_VOLTAGE or name in _MOTOR
+            is_joint_disturbance = name in _JOINT
             # Analytic physics has no joint damping and friction.
             if (actuator == "paper" or not is_motor_disturbance) and (
                 physics == "mujoco" or not is_joint_disturbance
@@ -476,10 +474,8 @@ def identified() -> Entries:
                 f"{estimate.value!r} {estimate.low!r} {estimate.high!r} {estimate.status}",
             )
 
-    columns, data_folder = (
-        "time=time:s,position=position:rad,torque=torque:N*m",
-        Path(os.environ.get("CODRL_MJ_DATA", "data")),
-    )
+    columns = "time=time:s,position=position:rad,torque=torque:N*m"
+    data_folder = Path(os.environ.get("CODRL_MJ_DATA", "data"))
     if not (data_folder / "bench_logs" / "dfki_pendulum").is_dir():
         # The real logs are optional: codrl-mj data dfki_pendulum downloads them.
         return

@@ -140,10 +140,8 @@ def counts(root: Path) -> tuple[dict[str, int], dict[str, list[str]]]:
             if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 continue
             functions += 1
-            qualified_name, is_internal = (
-                f"{module.name}.{node.name}",
-                not {node.name, owner.get(id(node))} & public,
-            )
+            qualified_name = f"{module.name}.{node.name}"
+            is_internal = not {node.name, owner.get(id(node))} & public
             # Only what users call needs Args and Returns; elsewhere such blocks are counted as
             # overhead.
             if is_internal:

@@ -145,12 +145,10 @@ def kill(
         time.sleep(0.005)
     training.send_signal(number)
     _, error = training.communicate()
-    status, reported, saved, num_hidden = (
-        training.returncode,
-        reported_steps(run),
-        saved_steps(run),
-        len(hidden_files(run)),
-    )
+    status = training.returncode
+    reported = reported_steps(run)
+    saved = saved_steps(run)
+    num_hidden = len(hidden_files(run))
     has_started, has_finished = (run / "config.json").exists(), (run / "result.json").exists()
     # Before Python has installed its handlers a signal ends the process with its number.
     if (

@@ -322,11 +322,9 @@ def fitted(path: Path) -> None:
 
 def planned(path: Path) -> None:
     """Draw the voltage of docs/identify_logs.md's plan, and the response of a simulated bench."""
-    motor, load, names = (
-        "maxon-ec45-flat-50w",
-        ("--inertia", "1e-4"),
-        ("voltage", "current", "velocity"),
-    )
+    motor = "maxon-ec45-flat-50w"
+    load = ("--inertia", "1e-4")
+    names = ("voltage", "current", "velocity")
     with tempfile.TemporaryDirectory() as temporary:
         log = Path(temporary) / "log.csv"
         words = ("--kind", "prbs", "--amplitude", "5.1", "--clock", "0.002", "--rate", "1000")

@@ -51,10 +51,8 @@ def unstable(env: ActuatedVectorEnv) -> int:
     """Return the number of actuators in use whose loop is unstable, each judged separately."""
     drawn = env.randomization
     assert drawn is not None
-    nominal, timestep = (
-        named_actuator("paper", env.task.name),
-        env.task.step_duration / env.setup.inner_steps,
-    )
+    nominal = named_actuator("paper", env.task.name)
+    timestep = env.task.step_duration / env.setup.inner_steps
     rows = ({name: float(drawn[name][row]) for name in RANDOMIZE} for row in range(env.num_envs))
     return sum(spectral_radius(nominal.replaced(values), timestep) >= 1.0 for values in rows)
 

@@ -90,10 +90,8 @@ class Options:
     def check(self) -> None:
         """Raise ValueError, naming field, value and bound, if a number is out of bounds."""
         for name in COUNTS + AMOUNTS:
-            minimum, maximum = (
-                int(name in COUNTS),
-                1 if name in ("gamma", "gae_lambda") else math.inf,
-            )
+            minimum = int(name in COUNTS)
+            maximum = 1 if name in ("gamma", "gae_lambda") else math.inf
             if not minimum <= getattr(self, name) <= maximum:
                 raise ValueError(
                     f"--{name.replace('_', '-')} {getattr(self, name)}: must be from {minimum} to"
@@ -153,15 +151,11 @@ class Agent(nn.Module):
     def __init__(self, observations: gym.Space[Any], actions: Any, hidden: int) -> None:  # noqa: D107
         super().__init__()
         self.discrete = isinstance(actions, gym.spaces.Discrete)
-        inputs, outputs = (
-            math.prod(observations.shape or ()),
-            int(actions.n) if self.discrete else actions.shape[0],
-        )
+        inputs = math.prod(observations.shape or ())
+        outputs = int(actions.n) if self.discrete else actions.shape[0]
         self.seen = Moments(inputs)
-        self.actor, self.critic = (
-            network(inputs, hidden, outputs, 0.01),
-            network(inputs, hidden, 1, 1.0),
-        )
+        self.actor = network(inputs, hidden, outputs, 0.01)
+        self.critic = network(inputs, hidden, 1, 1.0)
         if not self.discrete:
             self.log_std = nn.Parameter(torch.full((outputs,), -0.5))
             self.register_buffer("middle", torch.as_tensor(actions.high + actions.low) / 2)
@@ -262,22 +256,18 @@ def train(options: Options, on_rollout: Callable[[int, float], None] | None = No
                 (observations, actions, rewards, final_observations, terminated, ended, discounted)
             )
             finished += undiscounted[ended].tolist()
-            discounted, undiscounted, observations = (
-                discounted * ~ended,
-                undiscounted * ~ended,
-                next_observations,
-            )
+            discounted = discounted * ~ended
+            undiscounted = undiscounted * ~ended
+            observations = next_observations
         columns = (torch.as_tensor(np.stack(column)) for column in zip(*steps, strict=True))
         states, taken_actions, scaled_rewards, next_states, terminations, ends, discounted_sums = (
             columns
         )
         returns.update(discounted_sums.float().reshape(-1, 1))
         with torch.no_grad():
-            log_probs, values, next_values = (
-                agent.policy(states).log_prob(taken_actions),
-                agent.value(states),
-                agent.value(next_states),
-            )
+            log_probs = agent.policy(states).log_prob(taken_actions)
+            values = agent.value(states)
+            next_values = agent.value(next_states)
         # The scale of the discounted sums adapts the critic's targets to any task's rewards.
         scaled_rewards = scaled_rewards.float() / returns.scale()
         gains = advantages(

@@ -318,10 +318,8 @@ class DCMotorActuator(ActuatorModel):
     @property
     def assumed(self) -> str:
         """Note on a default voltage limit that limits the supply; see `ActuatorModel.assumed`."""
-        max_voltage, voltage = (
-            self.controller.max_voltage,
-            math.inf if self.supply is None else self.supply.voltage,
-        )
+        max_voltage = self.controller.max_voltage
+        voltage = math.inf if self.supply is None else self.supply.voltage
         if not (max_voltage == CurrentLoop.max_voltage and max_voltage < voltage < math.inf):
             return ""
         limit = (

@@ -472,11 +472,9 @@ def _radii(cls: Any, parameter_values: np.ndarray) -> np.ndarray:
         kp, ki = 0.0 * kp, 0.0 * ki
     # Current [A] that 1 V adds within a sample.
     current_per_volt = (1.0 - decay) / resistance
-    zero, ones, is_delayed = (
-        np.zeros(len(parameter_values)),
-        np.ones(len(parameter_values)),
-        columns.delayed != 0.0,
-    )
+    zero = np.zeros(len(parameter_values))
+    ones = np.ones(len(parameter_values))
+    is_delayed = columns.delayed != 0.0
     # Without an integral gain, the integral would only add an eigenvalue of 1.
     has_integral = ki > 0.0
     # Gains of the voltage for (current, integral, pending voltage).

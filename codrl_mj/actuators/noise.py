@@ -12,10 +12,8 @@ import math
 _MASK = 0xFFFFFFFF
 _EVEN, _ODD = 0xD2511F53, 0xCD9E8D57
 # Increments of the key in each round: the golden ratio and sqrt(3) - 1.
-_STEP_0, _STEP_1 = (
-    0x9E3779B9,
-    0xBB67AE85,
-)
+_STEP_0 = 0x9E3779B9
+_STEP_1 = 0xBB67AE85
 
 SENSOR_STREAM, LOAD_STREAM = 0, 1
 """Values of the last counter word. Streams with the same key share no numbers."""

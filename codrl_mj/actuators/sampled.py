@@ -161,11 +161,9 @@ def run_samples(
     """
     total, drawn, saturated, gain = 0.0, 0.0, 0, kp + ki
     tracking = ki / gain if gain > 0.0 else 0.0
-    voltage, sag, deadband = (
-        parameters.supply_voltage,
-        parameters.supply_resistance,
-        parameters.deadband,
-    )
+    voltage = parameters.supply_voltage
+    sag = parameters.supply_resistance
+    deadband = parameters.deadband
     for _ in range(samples):
         limit = max(voltage - sag * abs(current), 0.0) if sag > 0.0 else voltage
         error = reference - current

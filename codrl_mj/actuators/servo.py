@@ -168,11 +168,9 @@ def advance(
     period = timestep / count
     samples = max(int(period * parameters.sample_rate + 0.5), 1)
     max_torque = parameters.max_torque / parameters.gear_ratio
-    integral, command, steps_to_sample = (
-        state.velocity_integral,
-        state.commanded_torque,
-        state.steps_to_sample,
-    )
+    integral = state.velocity_integral
+    command = state.commanded_torque
+    steps_to_sample = state.steps_to_sample
     position, speed, applied = inputs.position, inputs.speed, 0.0
     amperes, volts, torque, power, loss = 0.0, 0.0, 0.0, 0.0, 0.0
     is_voltage_limited, is_current_limited, is_thermal = 0.0, 0.0, 0.0

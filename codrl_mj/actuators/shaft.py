@@ -119,10 +119,8 @@ def thermal_limit(
 
     While the motor is cold this exceeds the continuous current; at the limit it falls to that.
     """
-    without_loss, per_watt = (
-        rises_after(parameters, duration, heat, 0.0),
-        rises_after(parameters, duration, TemperatureRises(0.0, 0.0), 1.0),
-    )
+    without_loss = rises_after(parameters, duration, heat, 0.0)
+    per_watt = rises_after(parameters, duration, TemperatureRises(0.0, 0.0), 1.0)
     margin = (
         parameters.max_temperature
         - parameters.ambient_temperature
@@ -317,11 +315,9 @@ def advance_motor(
         if has_losses:
             shaft_now = Shaft(shaft.inertia, shaft.external_acceleration, speed)
             delivered -= friction(parameters, share * duration, delivered, shaft_now)
-        amperes, volts, torque = (
-            amperes + share * mean,
-            volts + share * voltage,
-            torque + share * delivered,
-        )
+        amperes = amperes + share * mean
+        volts = volts + share * voltage
+        torque = torque + share * delivered
         power, heat = power + share * power_now, heat + share * heat_now
         net_torque = delivered - viscous * (speed - shaft.speed)
         speed += share * duration * (net_torque / shaft.inertia + shaft.external_acceleration)

@@ -231,10 +231,8 @@ def linearize(
     """
     family: Any = type(actuator)
     period = actuator.steps_per_sample(timestep)
-    parameters, count = (
-        parameters_type(family)(*actuator.parameter_values),
-        len(family.State._fields),
-    )
+    parameters = parameters_type(family)(*actuator.parameter_values)
+    count = len(family.State._fields)
     parameters = parameters._replace(
         **{name: WITHOUT_FRICTION[name] for name in WITHOUT_FRICTION.keys() & {*parameters._fields}}
     )
@@ -288,10 +286,8 @@ def loop_radius(joints: Joints, loops: Sequence[np.ndarray], timestep: float) ->
         return math.inf
     # States that no other state reads, or that no other state changes, are not part of a loop and
     # are removed. Speeds always remain.
-    live, coupled = (
-        np.ones(len(product), dtype=bool),
-        (product != 0.0) & ~np.eye(len(product), dtype=bool),
-    )
+    live = np.ones(len(product), dtype=bool)
+    coupled = (product != 0.0) & ~np.eye(len(product), dtype=bool)
     coupled[:freedoms, :freedoms] = True
     while (
         remaining := live & coupled[live].any(axis=0) & coupled[:, live].any(axis=1)

@@ -91,10 +91,8 @@ class TwoStreams(nn.Module):
 
     def forward(self, state_and_action: torch.Tensor) -> torch.Tensor:
         """Return values (N, 1) of concatenated states and actions (N, state_size + action_size)."""
-        state, action = (
-            state_and_action[:, : self.state_size],
-            state_and_action[:, self.state_size :],
-        )
+        state = state_and_action[:, : self.state_size]
+        action = state_and_action[:, self.state_size :]
         return self.joint(torch.cat([self.state_stream(state), self.action_stream(action)], dim=1))
 
 

@@ -295,11 +295,9 @@ def derive(
         else ()
     )
     derivation = _Derivation(parsed_values, specs, lossy_quantities)
-    values, origins, printed = (
-        derivation.values,
-        derivation.origins,
-        {*derivation.values, "torque_constant"},
-    )
+    values = derivation.values
+    origins = derivation.origins
+    printed = {*derivation.values, "torque_constant"}
     values.setdefault("no_load_current", 0.0)
     derivation.apply_rules()
     for name, remedy in _NEEDED.items():
@@ -407,10 +405,8 @@ class _Derivation:
                     quantity = f"{name}_at_output"
                 else:
                     ratio = parsed_values["gear_ratio"].value
-                    value, shaft_text = (
-                        value * ratio**gear_exponent,
-                        f"{shaft_text} * {ratio:g}^{gear_exponent}",
-                    )
+                    value = value * ratio**gear_exponent
+                    shaft_text = f"{shaft_text} * {ratio:g}^{gear_exponent}"
             self.values[quantity], self.origins[quantity] = (
                 value,
                 f"{name} = {printed}{shaft_text}, printed",
@@ -493,10 +489,8 @@ class _Derivation:
         """Derive friction from the no-load current; by default it is Coulomb friction."""
         values = self.values
         coulomb, viscous = "coulomb_friction" in values, "viscous_friction" in values
-        total, formula = (
-            values["torque_constant"] * values["no_load_current"],
-            "torque_constant * no_load_current",
-        )
+        total = values["torque_constant"] * values["no_load_current"]
+        formula = "torque_constant * no_load_current"
         # The simulation subtracts friction behind the gear.
         if values.get("gear_efficiency", 1.0) != 1.0:
             total, formula = values["gear_efficiency"] * total, f"gear_efficiency * {formula}"
@@ -530,10 +524,8 @@ class _Derivation:
         disagreements = []
         for quantity, formula, explanation in CHECKS:
             if quantity in printed and self._can_evaluate(formula):
-                value, computed = (
-                    self.values[quantity],
-                    eval(compile_formula(formula), {}, self.values),
-                )
+                value = self.values[quantity]
+                computed = eval(compile_formula(formula), {}, self.values)
                 # Values that agree so closely were derived from each other.
                 if abs(computed - value) > 1e-9 * abs(value):
                     text = f"{formula} = {self._substituted(formula)}"

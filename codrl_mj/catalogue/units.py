@@ -207,7 +207,9 @@ def to_si(
     if not has_same_dimension or any(
         powers.get(name, 0) != si_powers.get(name, 0) for name in powers.keys() | si_powers
     ):
-        raise ValueError(f"{unit!r} is not a unit of {quantity_name}, which is in {si_unit or 'no unit'}")
+        raise ValueError(
+            f"{unit!r} is not a unit of {quantity_name}, which is in {si_unit or 'no unit'}"
+        )
     if si_unit == "degC":
         # Pint cannot convert a difference of temperatures to a temperature.
         if any(name.startswith("delta_") for name in names):

@@ -58,10 +58,8 @@ def flag_dataclass(
             annotation = flag_dataclass(nested[name], value)
             value = annotation()
         elif defaults is None:
-            annotation, text = (
-                annotation | None,
-                f"{setting['help']} Default: the named actuator's.".strip(),
-            )
+            annotation = annotation | None
+            text = f"{setting['help']} Default: the named actuator's.".strip()
             setting |= {"help": text, "help_behavior_hint": ""}
         fields.append((name, Annotated[annotation, tyro.conf.arg(**setting)], value))
     return dataclasses.make_dataclass(
@@ -138,10 +136,8 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
         )
         for option, hint, text, value in source.option_flags(defaults)
     ]
-    env_flags, family = (
-        flag_dataclass(EnvConfig, defaults, excluded, options),
-        type(defaults.actuators[0]),
-    )
+    env_flags = flag_dataclass(EnvConfig, defaults, excluded, options)
+    family = type(defaults.actuators[0])
     actuator, family_name = chosen.actuator, getattr(chosen, FAMILY)
     if actuator not in (None, AS_TRAINED, AS_CONFIGURED):
         try:

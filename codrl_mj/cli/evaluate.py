@@ -174,10 +174,8 @@ def _print_details(evaluations: Mapping[str, Evaluation]) -> None:
             continue
         unit = field.metadata["unit"]
         if unit == "share":
-            unit, values = (
-                "%",
-                [value and tuple(100.0 * bound for bound in value) for value in values],
-            )
+            unit = "%"
+            values = [value and tuple(100.0 * bound for bound in value) for value in values]
         rows.append(
             (f"{field.metadata['label']} [{unit.replace('*', '·')}]", *map(format_number, values))
         )

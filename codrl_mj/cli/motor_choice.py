@@ -82,10 +82,8 @@ class Feasible:
             self.name, self.gear_ratio, voltage=self.voltage, max_current=self.max_current
         )
         entry = find_entry(self.name)
-        continuous, unknown = (
-            entry.parameters.continuous_current if entry else None,
-            ignored_quantities(entry),
-        )
+        continuous = entry.parameters.continuous_current if entry else None
+        unknown = ignored_quantities(entry)
         demand = demand_of(self.task_or_run, trust=self.trust, motor=self.motor)
         judgment = feasibility(drive, demand, continuous)
         title = (
@@ -107,14 +105,10 @@ class Feasible:
             rows,
             right=("needs", "has"),
         )
-        required, best_drive = (
-            judgment.operating_points,
-            with_best_gear(drive, demand, continuous),
-        )
-        best_judgment, (low, high) = (
-            feasibility(best_drive, demand, continuous),
-            sizing.equivalent_gears(best_drive, demand, continuous),
-        )
+        required = judgment.operating_points
+        best_drive = with_best_gear(drive, demand, continuous)
+        best_judgment = feasibility(best_drive, demand, continuous)
+        (low, high) = sizing.equivalent_gears(best_drive, demand, continuous)
         print_text(
             f"{required.energy_drawn:.3g} J drawn and {required.copper_loss:.3g} J of heat per"
             f" episode, {required.rms_current:.3g} A rms; share of rotor and friction in the"
@@ -369,10 +363,8 @@ def _print_ranking(
             required.energy_drawn,
             required.copper_loss,
         )
-        gear, verdict = (
-            _gear_text(choice.drive, demands[name]),
-            Text(choice.feasibility.verdict, "red" if choice.rejection_reason else "green"),
-        )
+        gear = _gear_text(choice.drive, demands[name])
+        verdict = Text(choice.feasibility.verdict, "red" if choice.rejection_reason else "green")
         row = (
             *((name, choice.name) if has_motor_names else (choice.name,)),
             *(

@@ -44,11 +44,9 @@ def _step_duration(env: Any) -> float:
     A task's environment stores the duration. For other environments it is measured, because their
     `dt` does not include wrappers, such as one that repeats actions.
     """
-    recorder, actions, durations = (
-        env.get_wrapper_attr("recorder"),
-        copy.deepcopy(env.action_space),
-        list[float](),
-    )
+    recorder = env.get_wrapper_attr("recorder")
+    actions = copy.deepcopy(env.action_space)
+    durations = list[float]()
     if recorder is env.unwrapped:
         return float(recorder.step_duration)
     actions.seed(0)
@@ -131,10 +129,8 @@ class Interface:
             ValueError: entries are missing, unknown, in another order or unit, or come at another
                 rate.
         """
-        names, received = (
-            [entry["name"] for entry in self.observations],
-            [name for name, _ in observations],
-        )
+        names = [entry["name"] for entry in self.observations]
+        received = [name for name, _ in observations]
         if unknown := [name for name in received if name not in names]:
             raise ValueError(
                 f"observation {unknown[0]!r}: unknown to the policy;"

@@ -189,10 +189,8 @@ def extract_network(policy: Policy) -> Network | Tiles:
     model: Any = policy
     squashed = isinstance(model, SACPolicy | TD3Policy)
     if isinstance(model, ActorCriticPolicy) and not model.squash_output:
-        extractor, parts = (
-            model.pi_features_extractor,
-            [*model.mlp_extractor.policy_net, model.action_net],
-        )
+        extractor = model.pi_features_extractor
+        parts = [*model.mlp_extractor.policy_net, model.action_net]
     elif isinstance(model, SACPolicy):
         extractor, parts = model.actor.features_extractor, [*model.actor.latent_pi, model.actor.mu]
     elif isinstance(model, TD3Policy):

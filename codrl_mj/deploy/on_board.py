@@ -126,11 +126,9 @@ def advance_winding(
             * (2.0 * steady_current * decayed + deviation * decayed * (1.0 - 0.5 * decayed))
             / x
         )
-        current_sum, voltage_sum, power_sum = (
-            current_sum + mean_current,
-            voltage_sum + applied,
-            power_sum + applied * mean_current,
-        )
+        current_sum = current_sum + mean_current
+        voltage_sum = voltage_sum + applied
+        power_sum = power_sum + applied * mean_current
         current = steady_current + deviation * (1.0 - decayed)
     after = Winding(current, integral, pending)
     return (

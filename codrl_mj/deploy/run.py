@@ -123,11 +123,9 @@ def _exchange_frames(
 
     When the run ends or the generator is closed, a last frame sets the safe command.
     """
-    zeros, timeout, period = (
-        np.zeros(len(contract.observations)),
-        float(contract.late["after"]),
-        1.0 / contract.rate,
-    )
+    zeros = np.zeros(len(contract.observations))
+    timeout = float(contract.late["after"])
+    period = 1.0 / contract.rate
     start = due = time.monotonic()
     sequence = 0
     try:

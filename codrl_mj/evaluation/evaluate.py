@@ -281,11 +281,9 @@ def motor_traces(episode: Episode) -> list[MotorTrace]:
             if has_several
             else episode.signals["desired_force"]
         )
-        arm, force, speed = (
-            actuator.arm_radius,
-            motor_trace.pop("actual_force"),
-            motor_trace.pop("speed"),
-        )
+        arm = actuator.arm_radius
+        force = motor_trace.pop("actual_force")
+        speed = motor_trace.pop("speed")
         # With several motors the trace has the signals of all their families.
         signals = {
             name: motor_trace[name] for name in actuator.Signals._fields if name in motor_trace

@@ -279,11 +279,9 @@ def effort_lag(log: Log, effort: str) -> Shift | None:
     """
     log = log.slice_rows(slice(0, _MAX_LAG_ROWS))
     if effort == "voltage":
-        windows, max_lead, max_lag = (
-            Windows(log, max_windows=_MAX_LAG_WINDOWS),
-            3.0 * log.step,
-            20.0 * log.step,
-        )
+        windows = Windows(log, max_windows=_MAX_LAG_WINDOWS)
+        max_lead = 3.0 * log.step
+        max_lag = 20.0 * log.step
         terms = _voltage_terms(log, windows)
     else:
         windows, max_lead, max_lag = Windows(log, 0.3, _MAX_LAG_WINDOWS), 0.06, 0.06

@@ -163,11 +163,9 @@ class Column:
                 value, names = self._compile(inner)
                 return (lambda table: -value(table)) if isinstance(sign, ast.USub) else value, names
             case ast.BinOp(left=left, op=operator, right=right) if type(operator) in _OPERATORS:
-                (left_value, left_names), (right_value, right_names), apply = (
-                    self._compile(left),
-                    self._compile(right),
-                    _OPERATORS[type(operator)],
-                )
+                (left_value, left_names) = self._compile(left)
+                (right_value, right_names) = self._compile(right)
+                apply = _OPERATORS[type(operator)]
                 return (
                     lambda table: apply(left_value(table), right_value(table)),
                     left_names | right_names,

@@ -159,10 +159,8 @@ def _fit_state(
             changed[index] += length
             columns[:, index] = (_residuals(simulate, segment, changed) - residuals) / length
         # Iteratively reweighted least squares: rows are scaled by the roots of the soft-L1 weights.
-        row_scales, cost = (
-            (1.0 + (residuals / scale) ** 2) ** -0.25,
-            robust_cost(residuals, scale),
-        )
+        row_scales = (1.0 + (residuals / scale) ** 2) ** -0.25
+        cost = robust_cost(residuals, scale)
         step = np.linalg.lstsq(row_scales[:, None] * columns, -row_scales * residuals, rcond=1e-9)[
             0
         ]

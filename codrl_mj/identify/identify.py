@@ -83,10 +83,8 @@ def identify(
             message names the missing signals.
     """
     logs, held_out, duplicate_notes = separate_logs(logs, held_out)
-    fixed, motor = (
-        check_arguments(logs, rig, known or {}, friction, estimated, segment, base),
-        base_motor(base),
-    )
+    fixed = check_arguments(logs, rig, known or {}, friction, estimated, segment, base)
+    motor = base_motor(base)
     defaults = DEFAULTS | {
         name: getattr(motor, name) for name in LOSS_PARAMETERS if motor is not None
     }

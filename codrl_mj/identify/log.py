@@ -248,10 +248,8 @@ def find_obstacle(logs: Sequence[Log]) -> Finding | None:
             key=lambda stretch: stretch.stop - stretch.start,
             default=slice(0, 1),
         )
-        count, seconds = (
-            rows.stop - rows.start,
-            float(log.time[rows.stop - 1] - log.time[rows.start]),
-        )
+        count = rows.stop - rows.start
+        seconds = float(log.time[rows.stop - 1] - log.time[rows.start])
         is_moving = any(log is moving_log for moving_log in moving)
         if count < MIN_ROWS or (is_moving and seconds < MIN_DURATION):
             text = (
@@ -280,15 +278,11 @@ def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
                 " the input voltage"
             )
     elif is_moving:
-        lacking, remedy = (
-            "no torque, current or voltage that all moving logs have",
-            "fit logs with the same signals together",
-        )
+        lacking = "no torque, current or voltage that all moving logs have"
+        remedy = "fit logs with the same signals together"
     else:
-        lacking, remedy = (
-            "no position or velocity that changes",
-            "log a motion, or both voltage and current",
-        )
+        lacking = "no position or velocity that changes"
+        remedy = "log a motion, or both voltage and current"
     subject, pronoun = ("this log has", "it") if len(logs) == 1 else ("these logs have", "them")
     return Finding(
         "error",
@@ -403,10 +397,8 @@ def has_motion(log: Log) -> bool:
     if not log.has("velocity"):
         return False
     # The mean over 50 ms removes noise, but not the velocity of a moving shaft.
-    velocity, rows = (
-        log.signals["velocity"],
-        max(min(round(0.05 / log.step), len(log.time) // 4), 1),
-    )
+    velocity = log.signals["velocity"]
+    rows = max(min(round(0.05 / log.step), len(log.time) // 4), 1)
     return float(np.std(np.convolve(velocity, np.full(rows, 1.0 / rows), "valid"))) > 0.3 * float(
         np.std(velocity)
     )

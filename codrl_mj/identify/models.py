@@ -97,11 +97,9 @@ class WindingModel(Model):
         for count in (2, 8, 32):
             rows = []
             for segment in segments:
-                steps, current, speeds = (
-                    np.diff(segment.times),
-                    segment.measured,
-                    segment.speeds[:-1] * fixed["gear_ratio"],
-                )
+                steps = np.diff(segment.times)
+                current = segment.measured
+                speeds = segment.speeds[:-1] * fixed["gear_ratio"]
                 edges = np.arange(0, len(current), min(count, len(current) - 1))
                 rates = 0.5 * (current[1:] + current[:-1]), speeds, segment.inputs[:-1]
                 charge, angle, flux = (
@@ -403,15 +401,11 @@ def _shaft_regression(
     for segment in segments:
         times, step = segment.times, float(np.median(np.diff(segment.times)))
         if output == "position":
-            position, speed = (
-                segment.measured,
-                smoothed_speeds(times, segment.measured, times, max(window, 5.0 * step)),
-            )
+            position = segment.measured
+            speed = smoothed_speeds(times, segment.measured, times, max(window, 5.0 * step))
         else:
-            position, speed = (
-                segment.state[0] + integrate(segment.measured, times),
-                segment.measured,
-            )
+            position = segment.state[0] + integrate(segment.measured, times)
+            speed = segment.measured
         # The columns are gravity, a constant load, Coulomb friction, viscous friction and the
         # input.
         columns = (

@@ -333,10 +333,8 @@ def _infer_unit(
         return "s", "clock stamps, read as seconds since the first"
     if signal == "only":
         return "1", "rows where it is 0 are left out"
-    largest, is_integer = (
-        float(np.abs(values).max(initial=0.0)),
-        bool(np.all(values == np.round(values))),
-    )
+    largest = float(np.abs(values).max(initial=0.0))
+    is_integer = bool(np.all(values == np.round(values)))
     size = f"values up to {largest:.4g}"
     units = _time_units(values) if signal == "time" else []
     if len(units) == 1:

@@ -228,10 +228,8 @@ def _find_unsigned(
                 )
         for bits, largest in _SIGN_BITS.get(signal, ()):
             half = 2.0 ** (bits - 1)
-            high, low = (
-                (numbers >= half) & (numbers <= half + largest),
-                (numbers >= 0.0) & (numbers <= largest),
-            )
+            high = (numbers >= half) & (numbers <= half + largest)
+            low = (numbers >= 0.0) & (numbers <= largest)
             plausible = (numbers == np.round(numbers)) & (high | low)
             # A signal that changes its sign passes near 0 on both sides.
             is_near_zero = [

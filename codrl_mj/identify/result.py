@@ -137,10 +137,8 @@ def predict(fit: Fit, log: Log) -> Prediction:
         )
         # The rows that the initial state was fitted to are not predicted.
         errors.append(np.abs(simulated[-1] - segment.measured)[count:])
-    trace, error = (
-        make_trace(log.name, "shaft", model.output, segments, simulated),
-        float(np.concatenate(errors).mean()),
-    )
+    trace = make_trace(log.name, "shaft", model.output, segments, simulated)
+    error = float(np.concatenate(errors).mean())
     return Prediction(log.name, model.output, error, closed_loop_error(fit, log), trace)
 
 
@@ -278,10 +276,8 @@ class Identified:
         """Text on the actuator's supply and its source; None without an actuator."""
         if self.problem() is not None:
             return None
-        volts, source = (
-            self.actuator().voltage_limit,
-            "assumed: set supply.voltage in actuator.yaml",
-        )
+        volts = self.actuator().voltage_limit
+        source = "assumed: set supply.voltage in actuator.yaml"
         if self.base is not None:
             source = "of the motor (--motor)"
         elif self.supply is not None:

@@ -65,10 +65,8 @@ def _saturation(log: Log, signal: str) -> Iterator[Finding]:
     for name, bound in (("highest", float(values.max())), ("lowest", float(values.min()))):
         distances = np.abs(values - bound)
         margin = max(0.05 * spread, 3.5 * log.resolution.get(signal, 0.0))
-        clipped, nearby = (
-            distances <= 1e-6 * spread,
-            (distances > 1e-6 * spread) & (distances <= margin),
-        )
+        clipped = distances <= 1e-6 * spread
+        nearby = (distances > 1e-6 * spread) & (distances <= margin)
         # A clipped signal has a flat top; a signal that rests near 0 is not clipped there.
         if clipped.sum() >= 10 and clipped.sum() > 3 * nearby.sum() and abs(bound) > 0.2 * spread:
             row = int(log.row_numbers[np.flatnonzero(clipped)[0]])

@@ -101,10 +101,8 @@ def assess_fits(
                 )
         estimates += part_estimates
         warnings += fit_warnings(fit, unexplained_shares)
-    completed, unexplained = (
-        _complete(estimates, known, defaults),
-        max(unexplained_shares.values(), default=0.0),
-    )
+    completed = _complete(estimates, known, defaults)
+    unexplained = max(unexplained_shares.values(), default=0.0)
     if unexplained > MAX_UNEXPLAINED:
         reason = f"the fit leaves {unexplained:.0%} of a log's variation unexplained"
         completed = [
@@ -135,11 +133,9 @@ def _assess_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estim
     values, sizes, units = fit.values, scales, model.scales
     # The total friction is often known better than its components.
     if any(slopes):
-        names, matrix, values = (
-            (*names, "friction_torque"),
-            np.vstack([matrix, slopes]),
-            np.append(values, friction),
-        )
+        names = (*names, "friction_torque")
+        matrix = np.vstack([matrix, slopes])
+        values = np.append(values, friction)
         sizes, units = (
             np.append(array, full_friction["friction_torque"]) for array in (sizes, units)
         )
@@ -229,12 +225,10 @@ def _verdict(
         max_half_width: largest usable half-width, relative to `size`.
         self_test_value: value from a fit to data that were simulated with the fitted parameters.
     """
-    name, value, lower, upper = (
-        estimate.name,
-        estimate.value,
-        PARAMETERS[estimate.name].lower,
-        PARAMETERS[estimate.name].upper,
-    )
+    name = estimate.name
+    value = estimate.value
+    lower = PARAMETERS[estimate.name].lower
+    upper = PARAMETERS[estimate.name].upper
     # A value at this bound means no friction, and is not a sign of a failed fit.
     frictionless, share = upper if name == "gear_efficiency" else lower, 100.0 * half_width / size
     is_at_bound = min(value - lower, upper - value) <= BOUND_MARGIN * unit
@@ -251,10 +245,8 @@ def _verdict(
                 "refused",
                 f"a fit to its own simulation gives {self_test_value:.4g} instead of {value:.4g}",
             )
-        reference, main_cause = (
-            "all friction" if name in FRICTION else "it",
-            max(estimate.causes, key=estimate.causes.__getitem__),
-        )
+        reference = "all friction" if name in FRICTION else "it"
+        main_cause = max(estimate.causes, key=estimate.causes.__getitem__)
         reason = (
             f"its interval is {share:.3g} % of {reference} to either side, mostly because"
             f" {CAUSES[main_cause]}"

@@ -240,15 +240,11 @@ def _check_normalization(path: Path, model: Any) -> None:
     """Raise if a model was probably trained with `VecNormalize`; warn if that is unknown."""
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-    statistics_files, reason = (
-        [*path.parent.glob("*.pkl"), *path.parent.glob("*/vecnormalize.pkl")],
-        "",
-    )
-    last_observations, space, is_on_policy = (
-        model._last_obs,
-        model.observation_space,
-        isinstance(model, OnPolicyAlgorithm),
-    )
+    statistics_files = [*path.parent.glob("*.pkl"), *path.parent.glob("*/vecnormalize.pkl")]
+    reason = ""
+    last_observations = model._last_obs
+    space = model.observation_space
+    is_on_policy = isinstance(model, OnPolicyAlgorithm)
     # Only VecNormalize gives PPO and A2C original observations; algorithms with a replay buffer
     # always keep some.
     if is_on_policy and model._last_original_obs is not None:

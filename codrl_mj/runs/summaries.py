@@ -114,10 +114,8 @@ def describe_rank(evaluation: Mapping[str, Any] | None, total: float) -> str:
     if (seed := median_seed(evaluation)) is None or evaluation is None:
         return ""
     returns = evaluation["episode_returns"]
-    median, num_lower = (
-        returns[seed - evaluation["conditions"]["seed"]],
-        sum(value < total for value in returns),
-    )
+    median = returns[seed - evaluation["conditions"]["seed"]]
+    num_lower = sum(value < total for value in returns)
     return (
         f"{num_lower} of {len(returns)} evaluated episodes had a lower return; the median is"
         f" {median:.3g} (seed {seed})"

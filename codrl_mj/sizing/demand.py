@@ -202,10 +202,8 @@ def _demands_from_episodes(source: str, env: Any, episodes: Sequence[Any]) -> di
         if env.task == "pendulum":
             # A thin uniform rod about its end: inertia m*l^2/3, center of mass at l/2.
             length = core.l
-            inertia, gravity_torque = (
-                core.m * length**2 / 3.0 + env.joint.armature,
-                core.m * core.g * length / 2.0,
-            )
+            inertia = core.m * length**2 / 3.0 + env.joint.armature
+            gravity_torque = core.m * core.g * length / 2.0
             swing = Swing(
                 inertia,
                 gravity_torque,
@@ -228,10 +226,8 @@ def _demands_from_episodes(source: str, env: Any, episodes: Sequence[Any]) -> di
             np.append(episode.first_speeds[motor_index], episode_speeds[:, motor_index])
             for episode, episode_speeds in zip(episodes, speeds, strict=True)
         ]
-        kind, joint = (
-            mujoco.mjtTrn(model.actuator_trntype[actuator_id]),
-            model.actuator_trnid[actuator_id, 0],
-        )
+        kind = mujoco.mjtTrn(model.actuator_trntype[actuator_id])
+        joint = model.actuator_trnid[actuator_id, 0]
         sliding = kind in ON_JOINT and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
         gear = abs(float(model.actuator_gear[model.actuator_outadr[actuator_id], 0])) or 1.0
         demands[name] = Demand(

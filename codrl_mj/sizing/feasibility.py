@@ -88,13 +88,11 @@ def best_ratio(torque: Any, speed: Any, motor: GearMotor) -> Any:
 
 # -- bounds ----------------------------------------------------------------------------------------
 
-SURELY, DEPENDS, TRY_IT, HOPELESS, SURELY_NOT = (
-    "surely",
-    "it depends",
-    "try it",
-    "hopeless",
-    "surely not",
-)
+SURELY = "surely"
+DEPENDS = "it depends"
+TRY_IT = "try it"
+HOPELESS = "hopeless"
+SURELY_NOT = "surely not"
 VERDICTS = (SURELY, DEPENDS, TRY_IT, HOPELESS, SURELY_NOT)
 """Verdicts, from best to worst."""
 SUFFICIENT = ("voltage", "current", "heat", "rotor", "friction")
@@ -225,19 +223,17 @@ def feasibility(
             f"{drive!r}: must be a codrl_mj.actuators.Drive, a motor with gear and supply;"
             " codrl_mj.sizing.find_drive returns one for a name"
         )
-    required, unmet_verdict = (
-        operating_points(demand, drive),
-        SURELY_NOT if demand.exact else TRY_IT,
-    )
+    required = operating_points(demand, drive)
+    unmet_verdict = SURELY_NOT if demand.exact else TRY_IT
     bounds = []
     conditions = _conditions(drive, demand, required, continuous_current, unmet_verdict)
     for name, formula, load, available, unit, verdicts, remedy in conditions:
         needed = float(np.max(load))
         holds = needed <= available
         # Heat grows with the squared current: 10 times the heat is sqrt(10) times the current.
-        verdict, hopeless_limit = (
-            verdicts[not holds],
-            available * (math.sqrt(HOPELESS_RATIO) if name == "heat" else HOPELESS_RATIO),
+        verdict = verdicts[not holds]
+        hopeless_limit = available * (
+            math.sqrt(HOPELESS_RATIO) if name == "heat" else HOPELESS_RATIO
         )
         # A shortage that occurs only during brief peaks is not hopeless.
         lasting = float(np.quantile(load, 1.0 - MAX_PEAK_SHARE))
@@ -307,10 +303,8 @@ def _conditions(
     )
     remedy += _time_within(currents, max_current, "A")
     yield "current", "|i|, largest", currents, max_current, "A", (SURELY, unmet_verdict), remedy
-    rating, remedy = (
-        math.nan,
-        f"its continuous current is not known, must be at least {required.rms_current:.3g} A",
-    )
+    rating = math.nan
+    remedy = f"its continuous current is not known, must be at least {required.rms_current:.3g} A"
     if continuous is not None:
         rating = continuous
         remedy = (
@@ -332,11 +326,9 @@ def _conditions(
     remedy = "raise the supply, the largest current or the gear"
     yield "stall", "|tau| except braking, largest", driving, stall_torque, unit, verdicts, remedy
     peak = int(np.argmax(power))
-    torque, speed, min_voltage = (
-        abs(float(demand.torque[peak])) / motor.gear_efficiency,
-        abs(float(demand.speed[peak])),
-        0.0,
-    )
+    torque = abs(float(demand.torque[peak])) / motor.gear_efficiency
+    speed = abs(float(demand.speed[peak]))
+    min_voltage = 0.0
     # The lowest voltage [V] that delivers the largest power with the best gear.
     if torque * speed * motor.back_emf_constant > 0.0:
         min_voltage = (

@@ -143,11 +143,9 @@ def drive_limits(drive: Drive) -> DriveLimits:
 def max_power(drive: Drive) -> float:
     """Return the largest mechanical power [W], i (V - R i) kT/kE; infinite without back-EMF."""
     # R is the resistance of winding and supply. The power is maximal at half the stall current.
-    motor, limit, resistance = (
-        drive.motor,
-        drive.voltage_limit,
-        drive.motor.resistance + drive.supply_resistance,
-    )
+    motor = drive.motor
+    limit = drive.voltage_limit
+    resistance = drive.motor.resistance + drive.supply_resistance
     current = min(limit / resistance / 2, drive.controller.max_current)
     power = current * (limit - resistance * current) * motor.torque_constant
     return power / motor.back_emf_constant if motor.back_emf_constant else math.inf

@@ -118,13 +118,11 @@ def _sampled(actuator: CurrentLoopActuator, timestep: float | None) -> _Sampled:
         ),
     ):
         if gain:
-            pid, pid_denominator = (
-                np.polyadd(
-                    np.polymul(pid, term_denominator),
-                    gain * np.polymul(term_numerator, pid_denominator),
-                ),
-                np.polymul(pid_denominator, term_denominator),
+            pid = np.polyadd(
+                np.polymul(pid, term_denominator),
+                gain * np.polymul(term_numerator, pid_denominator),
             )
+            pid_denominator = np.polymul(pid_denominator, term_denominator)
     numerator = pid * period / inductance
     denominator = np.polymul(pid_denominator, [1.0, resistance * period / inductance - 1.0])
     # The feed-forward bypasses the error, so it appears only in the numerator from the reference.
@@ -299,11 +297,9 @@ def analyze_loop(actuator: CurrentLoopActuator, timestep: float | None = None) -
     """
     loop = _sampled(actuator, timestep)
     actuator.check(1.0 / loop.rate if timestep is None else timestep)
-    open_transfer, closed_transfer, response = (
-        open_loop(actuator, timestep),
-        closed_loop(actuator, timestep),
-        small_step_response(actuator, timestep),
-    )
+    open_transfer = open_loop(actuator, timestep)
+    closed_transfer = closed_loop(actuator, timestep)
+    response = small_step_response(actuator, timestep)
     # A search on the unit circle is accurate even for slow loops and the pole at z = 1, unlike the
     # polynomial roots that python-control uses. At half the sample rate (z = -1) the loop is real:
     # without an earlier crossing, the gain margin is defined there.

@@ -55,10 +55,8 @@ def energy_pumping(task: Task) -> Law:
     generator = np.random.default_rng(0)
 
     def law(states: np.ndarray) -> np.ndarray:
-        random_direction, speed = (
-            generator.choice([-1.0, 1.0], len(states)),
-            states[:, task.speed_indices[0]],
-        )
+        random_direction = generator.choice([-1.0, 1.0], len(states))
+        speed = states[:, task.speed_indices[0]]
         return np.inf * np.where(np.abs(speed) > 1e-6, speed, random_direction)
 
     return law

@@ -131,10 +131,8 @@ def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
             None,
             "no results of the study are available for this task: measure it",
         )
-    redesigned, boosted = (
-        redesign_loop(actuator, task),
-        measure_with_larger_command(actuator, task, response),
-    )
+    redesigned = redesign_loop(actuator, task)
+    boosted = measure_with_larger_command(actuator, task, response)
     options = option_bounds(evidence, task, severities(response, task))
     for name, improved in (
         (LOOP, None if redesigned is None else measure_on_task(redesigned, task)),
@@ -338,10 +336,8 @@ class Measurement(NamedTuple):
         floor = FLOORS.get(env.task) if self.baseline.arm == _baseline_arm(env.task) else None
         if floor is None:
             floor = evaluate(RandomPolicy(env.action_space), env, RANDOM_EPISODES).returns.mean
-        scores, succeeded = (
-            Scores(collected, {env.task: floor}, [self.baseline]),
-            _values(collected, self.baseline, "success"),
-        )
+        scores = Scores(collected, {env.task: floor}, [self.baseline])
+        succeeded = _values(collected, self.baseline, "success")
         if not scores.ceilings:
             raise ValueError(
                 f"{env.task}: ideal-trained policies are no better than random actions: train more"

@@ -172,10 +172,8 @@ class Evidence:
             paired_test: test whose scores of the same policies are the reference; None takes the
                 mean score of the policies that were trained and tested on ideal forces.
         """
-        scores, ideal_scores = (
-            self._tested.get((task, trained, tested), {}),
-            self._tested.get((task, "ideal", "ideal"), {}),
-        )
+        scores = self._tested.get((task, trained, tested), {})
+        ideal_scores = self._tested.get((task, "ideal", "ideal"), {})
         if paired_test is not None:
             paired = self._tested.get((task, trained, paired_test), {})
             values = [
@@ -218,10 +216,8 @@ class Evidence:
 
     def _curve_of(self, task: str, axis: str) -> dict[float, Outcome]:
         """Return severity -> loss of ideal-trained policies, for 0 and every tested severity."""
-        severities, reference_test = (
-            AXES[axis].severities,
-            f"{axis} 0" if AXES[axis].motor_at_zero else "ideal",
-        )
+        severities = AXES[axis].severities
+        reference_test = f"{axis} 0" if AXES[axis].motor_at_zero else "ideal"
         outcomes = {
             severity: self.outcome(task, "ideal", f"{axis} {severity:g}", reference_test)
             for severity in severities[1:]

@@ -227,10 +227,8 @@ def judge(
             for task, pairs in by_task.items()
             if (stratum := scores.stratum(pairs)) is not None
         }
-        strata, counts = (
-            list(strata_by_task.values()),
-            (sum(len(by_task[task]) for task in strata_by_task), len(question.contrasts)),
-        )
+        strata = list(strata_by_task.values())
+        counts = (sum(len(by_task[task]) for task in strata_by_task), len(question.contrasts))
         if not strata:
             tested.append((question, (0, 0), counts, Interval(*[np.nan] * 3), np.nan))
             continue

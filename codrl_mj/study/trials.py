@@ -301,11 +301,9 @@ class Grid:
         self, local_folders: Mapping[tuple[str, int], Path], finished_count: int, missing: int
     ) -> "Totals":
         """Return the published totals, plus those of trainings that are not in them yet."""
-        tests, published_totals, file = (
-            self.policy_tests,
-            Totals(0, 0, 0.0, {}),
-            (self.published or self.root) / TOTALS,
-        )
+        tests = self.policy_tests
+        published_totals = Totals(0, 0, 0.0, {})
+        file = (self.published or self.root) / TOTALS
         published_runs = {tests[key].run for key in self.published_rows}
         tested = {test.run for test in tests.values() if test.record.is_file()}
         if (

@@ -28,11 +28,9 @@ def check_fields(task: Any) -> None:
             names and all(isinstance(entry, str) for entry in names) and len({*names}) == len(names)
         )
         _require(task, name, is_valid, "one or more names, all different")
-    motors, forces, defaults = (
-        len(task.motors),
-        task.forces,
-        getattr(task.options, "_field_defaults", {"": None}),
-    )
+    motors = len(task.motors)
+    forces = task.forces
+    defaults = getattr(task.options, "_field_defaults", {"": None})
     is_valid = all(
         isinstance(entry, int | float) and not math.isnan(entry) for entry in defaults.values()
     )

@@ -153,11 +153,9 @@ class TrainConfig(Checked):
         missing = [name for name in names if name not in fields] if whole else []
         if missing:
             raise ValueError(f"not a training configuration: it has no {', '.join(missing)}")
-        env, settings, agent = (
-            fields.pop("env"),
-            fields.pop("settings", "default"),
-            fields.pop("agent", None),
-        )
+        env = fields.pop("env")
+        settings = fields.pop("settings", "default")
+        agent = fields.pop("agent", None)
         if whole:
             return cls(EnvConfig.from_mapping(env), agent_from_mapping(agent), **fields)
         if not isinstance(env, Mapping):

@@ -52,12 +52,10 @@ class Watcher(BaseCallback):
     ) -> None:
         """Store the arguments of `train`, and the list of signals that stop the training."""
         super().__init__()
-        self._config, self._out, self._stop_signals, self._on_progress = (
-            config,
-            out,
-            stop_signals,
-            on_progress,
-        )
+        self._config = config
+        self._out = out
+        self._stop_signals = stop_signals
+        self._on_progress = on_progress
         self._tensorboard = tensorboard
         self._marks = {"report": 0, "evaluation": 0, "checkpoint": 0}
         # Sum of the squared torque errors since the last report, and the number of samples.

@@ -169,10 +169,8 @@ def solve(
     R*i, u = kP*e + kI*I + kFF*i_ref (+ kE*omega), dI/dt = e, torque = kT*i. Such a loop has no
     derivative gain and no filter, is never saturated, and starts at rest.
     """
-    size, motors = (
-        len(start),
-        [actuator for actuator in actuators if isinstance(actuator, DCMotorActuator)],
-    )
+    size = len(start)
+    motors = [actuator for actuator in actuators if isinstance(actuator, DCMotorActuator)]
 
     def derivative(_: float, state: np.ndarray, desired: np.ndarray) -> np.ndarray:
         delivered, electrical = [*desired], []
@@ -309,10 +307,8 @@ def order_in_the_step(
             steps = task.step_duration / counts(extra_halvings)
             # The reference solution itself has errors of 1e-12.
             series.append(ConvergenceSeries(label, steps, np.array(errors), 1e-12))
-        title, y_label = (
-            f"{task.name}, {integrator}, {case}",
-            "largest error of the state [relative]",
-        )
+        title = f"{task.name}, {integrator}, {case}"
+        y_label = "largest error of the state [relative]"
         return order_case(promised, series, title, "integration step [s]", y_label)
 
     yield coarsest_passing(task, evaluate)
@@ -388,34 +384,26 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
         return
     if task.reference_env is None:
         yield Skipped("equations of motion that are not MuJoCo's", NO_REFERENCE_ENV)
-        equations, description, implementation = (
-            engine_equations(task),
-            "MuJoCo's own accelerations",
-            "MuJoCo",
-        )
+        equations = engine_equations(task)
+        description = "MuJoCo's own accelerations"
+        implementation = "MuJoCo"
     else:
-        equations, description, implementation = (
-            gymnasium_equations(task),
-            f"the equations of {task.oracle}",
-            task.oracle,
-        )
+        equations = gymnasium_equations(task)
+        description = f"the equations of {task.oracle}"
+        implementation = task.oracle
     start, forces, _ = free_run(task)
     for case, actuators in (
         ("ideal actuator", named_actuators("ideal", task)),
         ("motor in the loop", continuous_actuators(task)),
     ):
         solve_task = functools.partial(solve, task, equations, start, forces, actuators)
-        solution, motors = (
-            solve_task(),
-            [actuator.motor for actuator in actuators if isinstance(actuator, DCMotorActuator)],
-        )
+        solution = solve_task()
+        motors = [actuator.motor for actuator in actuators if isinstance(actuator, DCMotorActuator)]
         oracle = description if case == "ideal actuator" else f"{description} and of the motor"
         for integrator in task.integrators:
             fourth = integrator == "rk4" and not motors
-            promised, counts = (
-                4.0 if fourth else 1.0,
-                functools.partial(_step_counts, task, fourth, motors, quick=quick),
-            )
+            promised = 4.0 if fourth else 1.0
+            counts = functools.partial(_step_counts, task, fourth, motors, quick=quick)
             solve_textbook = functools.partial(solve_task, fourth=fourth)
             textbook = functools.partial(
                 _textbook_distance, task, solve_textbook, solution, counts, promised

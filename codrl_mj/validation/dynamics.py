@@ -106,11 +106,9 @@ def one_step(
     extreme forces, with MuJoCo's force limit raised to the extreme ones; and a grid of states under
     commands up to `EXTREME` times the limit, where Gymnasium gets the limited force.
     """
-    generator, limit, is_planar = (
-        np.random.default_rng(0),
-        task.max_force,
-        len(task.state_names) == 2,
-    )
+    generator = np.random.default_rng(0)
+    limit = task.max_force
+    is_planar = len(task.state_names) == 2
     bounds, samples = np.array(reference.bounds), 200 if quick else 10_000
     states = generator.uniform(-bounds, bounds, (samples, len(bounds)))
     forces = generator.uniform(-limit, limit, samples)

@@ -92,12 +92,10 @@ class DriveOracle:
         """
         motor, charge, current, integral = self._motor, 0.0, self._current, self._integral
         (decay, _, effect), (charge_per_current, _, charge_per_volt) = self._winding
-        back_emf, kp, ki, max_voltage = (
-            motor.back_emf_constant * speed,
-            self.kp,
-            self.ki,
-            self._voltage,
-        )
+        back_emf = motor.back_emf_constant * speed
+        kp = self.kp
+        ki = self.ki
+        max_voltage = self._voltage
         reference = min(max(desired / motor.torque_constant, -self._max_current), self._max_current)
         for _ in range(self._samples):
             error = reference - current
@@ -126,18 +124,14 @@ class JointOracle:
     def __init__(self, task: Task, actuator: Drive, timestep: float, integrator: str) -> None:
         """Prepare a task with a reference environment and one motor; `timestep` is in seconds."""
         motor, arm = actuator.motor, actuator.motor.arm_radius / actuator.motor.gear_ratio
-        self._armature, self._damping = (
-            motor.rotor_inertia / arm**2,
-            motor.viscous_friction / arm**2,
-        )
+        self._armature = motor.rotor_inertia / arm**2
+        self._damping = motor.viscous_friction / arm**2
         self._friction = motor.coulomb_friction / arm
         self._task, self._timestep, self._integrator = task, timestep, integrator
         assert task.reference_env is not None
-        self._reference_env, self._equations, self._speed_index = (
-            task.reference_env(),
-            gymnasium_equations(task),
-            task.speed_indices[0],
-        )
+        self._reference_env = task.reference_env()
+        self._equations = gymnasium_equations(task)
+        self._speed_index = task.speed_indices[0]
         _, slope = self._linear(np.zeros(len(task.state_names)))
         # MuJoCo's defaults: impedance d = 0.9 at zero violation (solimp), a time constant of 0.02 s
         # but at least two steps (solref), and a largest impedance of 0.95.
@@ -186,11 +180,9 @@ _ORACLE = (
 def task_motor_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
     """Compare a task's run with its drive of `TASK_MOTORS`, under random bang-bang commands."""
     actuator, generator = task_drive(task.name), np.random.default_rng(0)
-    inner_steps, arm, speed_index = (
-        task.motor_inner_steps,
-        actuator.arm_radius,
-        task.speed_indices[0],
-    )
+    inner_steps = task.motor_inner_steps
+    arm = actuator.arm_radius
+    speed_index = task.speed_indices[0]
     # The oracle computes every sample in Python, so their number is limited.
     max_steps = round(
         (5e4 if quick else 5e5) / (task.step_duration * actuator.controller.sample_rate)
@@ -203,10 +195,8 @@ def task_motor_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
     timestep, state = task.step_duration / inner_steps, task.draw_initial_state(generator, None)
     physics = MujocoPhysics(SimulationConfig(task, [actuator], inner_steps, integrator))
     physics.reset(state)
-    winding, mechanics = (
-        DriveOracle(actuator, timestep),
-        JointOracle(task, actuator, timestep, integrator),
-    )
+    winding = DriveOracle(actuator, timestep)
+    mechanics = JointOracle(task, actuator, timestep, integrator)
     gaps: list[np.ndarray] = []
     names, error = task.state_names, ""
     for force in task.max_force * generator.choice([-1.0, 1.0], steps):
@@ -279,8 +269,6 @@ def drive_checks(quick: bool) -> Iterator[tuple[Case, ...]]:
             for rows in zip(torques.tolist(), speeds.tolist(), strict=True)
         ]
     )
-    names, gaps = (
-        list(closed_form),
-        (np.abs(ours - reference) / stalls for reference in (exact, stepped)),
-    )
+    names = list(closed_form)
+    gaps = (np.abs(ours - reference) / stalls for reference in (exact, stepped))
     yield tuple(Case(gap, lambda index: names[index % len(names)]) for gap in gaps)

@@ -60,14 +60,10 @@ def write(collected: StudyResults, out: Path) -> list[Path]:
     Returns:
         Files that were written.
     """
-    folder, scores = (
-        out / FOLDER,
-        Scores(collected, FLOORS, [ideal_trial(ideal_arm(task)) for task in SECONDS]),
-    )
-    primary_verdicts, secondary_verdicts = (
-        judge(scores, primary(), primary=True),
-        judge(scores, secondary()),
-    )
+    folder = out / FOLDER
+    scores = Scores(collected, FLOORS, [ideal_trial(ideal_arm(task)) for task in SECONDS])
+    primary_verdicts = judge(scores, primary(), primary=True)
+    secondary_verdicts = judge(scores, secondary())
     tables = write_tables(folder, collected, scores, primary_verdicts, secondary_verdicts)
     evidence = Evidence.read(*(path for study in STUDIES if (path := out / study / RUNS).is_file()))
     advice_rows = list(advised.rows(evidence))

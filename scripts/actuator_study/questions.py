@@ -89,11 +89,9 @@ A torque constant that the loop does not know is the axis `weakness`.
 
 def wrong_motors(task: str) -> dict[str, EnvConfig]:
     """Return environments whose actuator differs from the trained `weaker`, by name."""
-    nominal, step, force = (
-        study_env(task, "weaker"),
-        find_task(task).step_duration,
-        find_task(task).max_force,
-    )
+    nominal = study_env(task, "weaker")
+    step = find_task(task).step_duration
+    force = find_task(task).max_force
     # Pushes and friction are given as shares of the task's largest force.
     motor = nominal.actuator.motor
 

@@ -123,10 +123,8 @@ def write(collected: StudyResults, out: Path) -> list[Path]:
     Returns:
             Files that were written.
     """
-    folder, scores = (
-        out / FOLDER,
-        Scores(collected, FLOORS, [ideal_trial(ideal_arm(task)) for task in TASKS]),
-    )
+    folder = out / FOLDER
+    scores = Scores(collected, FLOORS, [ideal_trial(ideal_arm(task)) for task in TASKS])
     primary_verdicts = judge(scores, primary(), primary=True, min_policies=PLANNED)
     secondary_verdicts = judge(scores, secondary(), min_policies=PLANNED)
     tables = write_tables(folder, collected, scores, primary_verdicts, secondary_verdicts)
@@ -317,10 +315,8 @@ def _secondary(verdicts: Sequence[Verdict]) -> str:
 
 def _method(collected: StudyResults, rising: Sequence[str], count: int) -> str:
     totals, num_planned = collected.totals, len(collected.grid.cells)
-    num_tested, num_tests = (
-        sum(map(len, collected.evaluations.values())),
-        len(collected.grid.policy_tests),
-    )
+    num_tested = sum(map(len, collected.evaluations.values()))
+    num_tests = len(collected.grid.policy_tests)
     text = f"""The study follows [its plan](insurance_plan.md), with the scores and tests of [the first
 study](actuators.md). It has {num_tested} of {num_tests} tests of {num_planned} policies
 ({totals.seconds / 3600:.1f} hours of one core in the available runs).

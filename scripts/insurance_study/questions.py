@@ -268,10 +268,8 @@ def secondary() -> list[Question]:
     """Return all secondary questions, each on a single task, in sections."""
     # Names of sections are values of published rows; the page shows other titles.
     parts: list[tuple[str, str, tuple[Contrast, ...]]] = []
-    every, at_home_too = (
-        tuple(AXES),
-        (("matched", tuple(AXES)), ("drawn", DRAWN), ("remembering", REMEMBERED)),
-    )
+    every = tuple(AXES)
+    at_home_too = (("matched", tuple(AXES)), ("drawn", DRAWN), ("remembering", REMEMBERED))
     for task in TASKS:
         parts += [
             (

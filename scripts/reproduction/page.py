@@ -108,10 +108,8 @@ def _ours(findings: Findings, claim: Claim, verdict: Verdict) -> str:
 
 
 def _without(findings: Findings, claim: Claim) -> str:
-    mean, ideal = (
-        claim.without_motor(findings.runs),
-        f"{claim.task}, {claim.settings}, ideal, mujoco",
-    )
+    mean = claim.without_motor(findings.runs)
+    ideal = f"{claim.task}, {claim.settings}, ideal, mujoco"
     if mean is None:
         return ""
     return _minus(as_text(claim.measure, mean)) + (
@@ -180,10 +178,8 @@ def _method(findings: Findings) -> str:
         (CURVES, "curves"),
         (EVERYTHING, "everything else"),
     )
-    links, episodes = (
-        ", ".join(f"[{name}]({FOLDER}/{file})" for file, name in files),
-        findings.plan["test_episodes"],
-    )
+    links = ", ".join(f"[{name}]({FOLDER}/{file})" for file, name in files)
+    episodes = findings.plan["test_episodes"]
     return f"""## How it was measured
 
 The {len(rows)} trainings took {hours:.1f} hours on one core. Every policy was tested with greedy actions in {episodes} episodes

@@ -119,10 +119,8 @@ def record(
     Third-party environments store their images while they run, and the camera `fixed` selects their
     default camera. Tasks are rendered later from their states.
     """
-    render_options, recorders = (
-        env.source.view(env, width, height, None if camera == "fixed" else camera),
-        [],
-    )
+    render_options = env.source.view(env, width, height, None if camera == "fixed" else camera)
+    recorders = []
     if render_options is None:
         return Panel(env.task, run_episodes(policy, env.make, 1, seed)[0])
 

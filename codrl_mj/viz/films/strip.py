@@ -11,19 +11,15 @@ from codrl_mj.tasks import TASKS
 
 _DPI = 100
 # Heights [px], from top to bottom.
-HEADER_HEIGHT, TORQUE_HEIGHT, GAP, VOLTAGE_HEIGHT, TIME_HEIGHT = (
-    24,
-    120,
-    8,
-    60,
-    26,
-)
+HEADER_HEIGHT = 24
+TORQUE_HEIGHT = 120
+GAP = 8
+VOLTAGE_HEIGHT = 60
+TIME_HEIGHT = 26
 PLOT_HEIGHT = TORQUE_HEIGHT + GAP + VOLTAGE_HEIGHT
 # Widths [px] left and right of the plots. The margin has room for half of the last tick label.
-AXIS_WIDTH, MARGIN = (
-    62,
-    16,
-)
+AXIS_WIDTH = 62
+MARGIN = 16
 # Colors that color-blind people can distinguish (Okabe and Ito).
 DESIRED, ACTUAL, VOLTAGE, SATURATED = (
     "#0072B2",

@@ -84,14 +84,12 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
 def _mutations(certificate: Certificate, results: Sequence[MutationResult]) -> page.Section:
     rows = []
     for outcome in results:
-        clearest, cells = (
-            outcome.clearest_failure,
-            [
-                outcome.mutation,
-                outcome.task or "the motor",
-                f"{len(outcome.failed)} of {outcome.num_checks}",
-            ],
-        )
+        clearest = outcome.clearest_failure
+        cells = [
+            outcome.mutation,
+            outcome.task or "the motor",
+            f"{len(outcome.failed)} of {outcome.num_checks}",
+        ]
         clearest_cells = ["none", "", "", ""]
         if clearest is not None:
             values = (clearest.worst, clearest.tolerance, clearest.tolerance_ratio)

@@ -75,10 +75,8 @@ def torque_speed_diagram(drive: Drive, numbers: Any = None, points: Any = None) 
     curves: list[Curve] = []
     peak = max(color_index for _, _, color_index in lines if color_index < 2)
     for label, current, color_index in lines:
-        names, torques = (
-            (f"{label}, lowest", f"{label}, highest"),
-            torque_limits(drive, speeds, current),
-        )
+        names = (f"{label}, lowest", f"{label}, highest")
+        torques = torque_limits(drive, speeds, current)
         curves += envelope(
             names, speeds, torques, color_index == peak, colour=color_index, dashed=color_index == 2
         )
@@ -199,11 +197,9 @@ def torque_range(actuator: Any, speeds: np.ndarray) -> tuple[np.ndarray, np.ndar
         low, high = (np.clip(end, -max_value, max_value) for end in lines)
         return low, high
     if isinstance(actuator, DCMotorActuator) and actuator.voltage_limit is not None:
-        motor, supply, max_value = (
-            actuator.motor,
-            actuator.supply or Supply(),
-            actuator.controller.max_voltage,
-        )
+        motor = actuator.motor
+        supply = actuator.supply or Supply()
+        max_value = actuator.controller.max_voltage
         # The controller's limit applies to the motor's voltage. The supply's limit includes the
         # voltage drop over its resistance.
         limited = (
@@ -270,10 +266,8 @@ def bode_plots(loops: Loops, designed: Mapping[str, LoopAnalysis]) -> list[Plot]
                 "colour": index if len(loops) > 1 else int(not dashed),
                 "dashed": dashed,
             }
-            decibels, degrees = (
-                20.0 * np.log10(np.abs(values)),
-                np.degrees(np.unwrap(np.angle(values))),
-            )
+            decibels = 20.0 * np.log10(np.abs(values))
+            degrees = np.degrees(np.unwrap(np.angle(values)))
             gains.append(Curve(prefix + label, frequencies, decibels, **style))
             phases.append(Curve(prefix + label, frequencies, degrees, **style))
     if len(loops) == 1:
@@ -429,10 +423,8 @@ def torque_step_plot(steps: Mapping[str, tuple[ActuatorModel, float, float]]) ->
             or desired == 0.0
         ):
             continue
-        parameters, state = (
-            parameters_type(kind)(*actuator.parameter_values),
-            kind.State(*[0.0] * len(kind.State._fields)),
-        )
+        parameters = parameters_type(kind)(*actuator.parameter_values)
+        state = kind.State(*[0.0] * len(kind.State._fields))
         share = [0.0]
         for tick in range(100):
             inputs = Inputs(desired, 0.0, 0.0, tick * timestep, 0.0)

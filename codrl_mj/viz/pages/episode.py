@@ -102,10 +102,8 @@ class _MotorSeries(MotorTrace):
         time = self.timestep * (np.arange(len(values)) + (not held))
         # A held value needs the end of the last step too, to be drawn over its whole length.
         if held:
-            time, values = (
-                np.append(time[selection], time[-1] + self.timestep),
-                np.append(values[selection], values[-1]),
-            )
+            time = np.append(time[selection], time[-1] + self.timestep)
+            values = np.append(values[selection], values[-1])
         else:
             time, values = time[selection], values[selection]
         style: Any = {"style": "step" if held else "line", "colour": color, "dashed": dashed}

@@ -348,10 +348,8 @@ def _draw(plot: Plot, axes: Any, ink: str, points: int) -> None:
     for position, text in zip(
         itertools.product((0.015, 0.985), (0.985, 0.015)), plot.corners, strict=False
     ):
-        horizontal_alignment, vertical_alignment = (
-            ("left", "right")[position[0] > 0.5],
-            ("bottom", "top")[position[1] > 0.5],
-        )
+        horizontal_alignment = ("left", "right")[position[0] > 0.5]
+        vertical_alignment = ("bottom", "top")[position[1] > 0.5]
         axes.text(
             *position,
             text,

@@ -211,10 +211,8 @@ def _sentence(run: RunSummary) -> str:
     )
     text = f"{agent} on {run.task or 'an unknown task'} through {actuator}{steps}, seed {run.seed}."
     if run.evaluation is not None and run.evaluation_return is not None:
-        returns, episodes = (
-            page.format_number(run.evaluation["returns"]),
-            run.evaluation.get("episodes"),
-        )
+        returns = page.format_number(run.evaluation["returns"])
+        episodes = run.evaluation.get("episodes")
         text += f" Its policy returns {returns} over {episodes} episodes"
         if isinstance(success := run.evaluation.get("success"), Mapping):
             text += f" and succeeds in {100 * success['mean']:.3g} % of them"

@@ -251,10 +251,8 @@ def _meshes(model: mujoco.MjModel, mesh_ids: list[tuple[str, int]]) -> list[dict
         simple_vertices, corners = simplify_mesh(
             vertices, triangles, max(32, int(TRIANGLES * len(triangles) / max(total, 1)))
         )
-        low, span = (
-            simple_vertices.min(axis=0),
-            max(float(np.ptp(simple_vertices, axis=0).max()), 1e-12),
-        )
+        low = simple_vertices.min(axis=0)
+        span = max(float(np.ptp(simple_vertices, axis=0).max()), 1e-12)
         grid = np.round((simple_vertices - low) / span * 65535).astype(np.uint16)
         index = corners.astype(np.uint16 if len(simple_vertices) < 65536 else np.uint32)
         entries.append(

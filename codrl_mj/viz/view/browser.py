@@ -84,11 +84,9 @@ class Browser:
                 plotted = now
                 self._update_plots()
             if now - rate_start > 1.0:
-                self._real_time_factor, simulated, rate_start = (
-                    simulated / (now - rate_start),
-                    0.0,
-                    now,
-                )
+                self._real_time_factor = simulated / (now - rate_start)
+                simulated = 0.0
+                rate_start = now
             self._update_status()
             time.sleep(max(0.0, _FRAME_TIME - (time.perf_counter() - now)))
 
@@ -155,11 +153,9 @@ class Browser:
                     wxyz=shape.orientation,
                 )
         initial_camera = self.server.initial_camera
-        initial_camera.position, initial_camera.look_at, initial_camera.up = (
-            view.eye,
-            view.target,
-            np.array([0.0, 0.0, 1.0]),
-        )
+        initial_camera.position = view.eye
+        initial_camera.look_at = view.target
+        initial_camera.up = np.array([0.0, 0.0, 1.0])
         initial_camera.fov = np.radians(view.fovy)
 
     def _update_frames(self) -> None:
@@ -261,10 +257,8 @@ class Browser:
         ) in session.config.actuators_by_name.items():
             suffix = f" {pattern}" if len(session.config.actuators_by_name) > 1 else ""
             family = actuator.family or type(actuator).__name__
-            change, found_controls = (
-                functools.partial(session.set_actuator, pattern),
-                controls(actuator, _MAX_SUPPLY),
-            )
+            change = functools.partial(session.set_actuator, pattern)
+            found_controls = controls(actuator, _MAX_SUPPLY)
             for part, fields in itertools.groupby(
                 found_controls,
                 lambda control: control.path[0] if len(control.path) > 1 else family,  # noqa: B023

@@ -81,11 +81,9 @@ def controls(
     kind: Any = type(settings)
     result, nested, docs = [], nested_types(kind), field_docs(kind)
     for field in dataclasses.fields(settings):
-        value, field_path, documentation = (
-            getattr(settings, field.name),
-            (*path, field.name),
-            docs.get(field.name),
-        )
+        value = getattr(settings, field.name)
+        field_path = (*path, field.name)
+        documentation = docs.get(field.name)
         if field.name in nested:
             result += controls(
                 field.metadata.get("absent") if value is None else value, scale, ends, field_path
@@ -303,10 +301,8 @@ class Session:
             if was_reset or not np.isfinite(np.asarray(self.observation)).all():
                 raise ArithmeticError("the simulation diverged to numbers that are not finite")
         except ArithmeticError as error:
-            self.problem, self._diverged = (
-                f"{error}; reset it, and change the settings of the motor",
-                True,
-            )
+            self.problem = f"{error}; reset it, and change the settings of the motor"
+            self._diverged = True
             return False
         rows = self.recorder.trace
         for row in rows:
