@@ -184,7 +184,7 @@ def test_attributes_of_a_custom_task_read_and_write_its_model():
     assert env.model.opt.gravity[2] == -3.7
     assert env.model.body("upper").mass[0] == 2.0
     np.testing.assert_array_equal(env.model.body("upper").inertia, [0.06, 0.06, 0.002])
-    with pytest.raises(AttributeError, match="several motors"):
+    with pytest.raises(AttributeError, match="only be written in an environment with one motor"):
         env.largest_torques = (9.0, 4.0)
     with pytest.raises(AttributeError, match="compiled"):
         env.reach = 1.0

@@ -123,8 +123,8 @@ class Train:
 
     Example: codrl-mj train cartpole --actuator weaker --env.center-radius 0.1 --out
     runs/through-weaker, and after an interruption codrl-mj train --resume runs/through-weaker. Name
-    other environments by their Gymnasium ids: codrl-mj train HalfCheetah-v5 --actuators
-    'b.*=maxon-ec45-flat-50w' 'f.*=lag'
+    other environments by their
+    Gymnasium ids: codrl-mj train HalfCheetah-v5 --actuators 'b.*=maxon-ec45-flat-50w' 'f.*=lag'
     """
 
     config: Path | None = None

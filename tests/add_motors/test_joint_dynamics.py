@@ -186,7 +186,7 @@ def test_configurations_without_joint_dynamics_are_unchanged():
     ("task", "value", "message"),
     [
         ("HalfCheetah-v5", "both", "joint_dynamics = 'both': must be keep, replace, or None"),
-        ("pendulum", "replace", "joint_dynamics = 'replace': pendulum has none"),
+        ("pendulum", "replace", "joint_dynamics = 'replace': pendulum has no such field"),
     ],
 )
 def test_invalid_joint_dynamics_raise(task, value, message):

@@ -560,7 +560,7 @@ def test_raises_with_field_value_and_remedy(case):
     ],
 )
 def test_a_division_by_an_angle_is_optional_where_it_is_not_printed(unit, kind, size):
-    assert units.to_si(3.0, unit, kind, weights=True) == pytest.approx(3.0 * size, rel=1e-12)
+    assert units.to_si(3.0, unit, kind, mass_as_weight=True) == pytest.approx(3.0 * size, rel=1e-12)
 
 
 def test_contradictions_are_only_listed_if_not_strict():

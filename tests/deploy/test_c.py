@@ -36,7 +36,7 @@ def each(names, in_float):
 
 def write_c(folder, task, agent="ppo", settings=(), double=False, **changes):
     """Write the C files of a policy with random weights; return the policy and its contract."""
-    policy, _ = trained(task, agent, **dict(settings))
+    policy, _ = trained(task, agent, changes, **dict(settings))
     contract = Contract.from_policy(policy, EnvConfig(task, **changes), agent, 1, double=double)
     for name, content in c_files(extract_network(policy), contract).items():
         (folder / name).write_text(content)

@@ -28,12 +28,14 @@ TASKS = {
 SMALL = {"hidden": (16, 16)}
 
 
-def trained(task, agent, **settings):
-    """Return a policy with random weights whose actions depend on the observation; its settings."""
+def trained(task, agent, env=None, **settings):
+    """Return a policy with random weights whose actions depend on the observation; its settings.
+
+    `env` has fields of the environment, which the policy fits.
+    """
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    env = EnvConfig(task)
-    instance = env.make()
+    instance = EnvConfig(task, **(env or {})).make()
     config = AGENTS[agent](**settings)
     policy = config.make_policy(instance.observation_space, instance.action_space)
     instance.close()

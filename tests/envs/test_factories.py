@@ -240,8 +240,8 @@ def test_the_task_of_a_configuration_can_be_replaced():
         (
             lambda: make("pendulum", ["lag", "lag"]),
             (
-                r"got 2 actuators, but pendulum has 1 motor \(motor\); a list .* is for"
-                r" codrl_mj.make_vec"
+                r"got 2 actuators, but pendulum has 1 motor \(motor\); codrl_mj\.make_vec takes a"
+                r" list with an actuator for each environment"
             ),
         ),
         (

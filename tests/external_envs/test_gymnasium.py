@@ -495,7 +495,7 @@ MOTOR = {"motor": MAXON[".*"]}
         ),
         (
             {"env": "CartPole-v1"},
-            "has no MuJoCo model built from XML, and so no motors: use 'cartpole'",
+            "has no MuJoCo model built from XML, and so no motors: use this package's task 'cartpole'",
         ),
     ],
 )

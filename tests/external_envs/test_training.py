@@ -145,7 +145,10 @@ def test_a_file_assigns_actuators_to_patterns(tmp_path):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"task": "HalfCheetah-v5", "actuator": {}}, "actuator = {}: must be one for all"),
+        (
+            {"task": "HalfCheetah-v5", "actuator": {}},
+            "actuator = {}: must be one actuator for all motors, or a mapping of patterns",
+        ),
         ({"task": "HalfCheetah-v5", "actuator": {"(": "lag"}}, "must be a regular expression"),
         (
             {"task": "HalfCheetah-v5", "actuator": {".*": "maxon-ec45-flat"}},
@@ -157,7 +160,10 @@ def test_a_file_assigns_actuators_to_patterns(tmp_path):
         ),
         ({"task": "HalfCheetah-v5", "max_episode_steps": 0}, "must be an integer >= 1"),
         ({"task": "HalfCheetah-v5", "options": {"frame_skip": {1, 2}}}, "that JSON can hold"),
-        ({"task": "HalfCheetah-v5", "levels": [1.0]}, "HalfCheetah-v5 has none"),
+        (
+            {"task": "HalfCheetah-v5", "levels": [1.0]},
+            r"levels = \[1\.0\]: HalfCheetah-v5 has no such field",
+        ),
     ],
 )
 def test_raises_for_bad_configurations(fields, message):
