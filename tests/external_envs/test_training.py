@@ -445,8 +445,8 @@ def test_an_episode_is_filmed_with_the_strip_of_a_motor(reacher, capsys):
         (
             "train CartPole-v1",
             (
-                "CartPole-v1: the environment has no MuJoCo model .*: use 'cartpole', the task of"
-                " this package that has motors"
+                "CartPole-v1: the environment has no MuJoCo model .*: use this package's task"
+                " 'cartpole', which has motors"
             ),
         ),
         ("motor choose Reacher-v5", "no scripted controller for it; train it"),
