@@ -184,7 +184,7 @@ REACHER_ENV = gym.make("Reacher-v5")
         (lambda: mujoco.MjSpec(), "add motors to a MjSpec with codrl_mj.add_motors"),
         (lambda: codrl_mj.make("Reacher-v5", "lag"), "which has motors already; pass its name"),
         (lambda: codrl_mj.make("pendulum"), "which has motors already; pass its name"),
-        (lambda: gym.make("Pendulum-v1"), "env = lambda: the environment has no MuJoCo model bu"),
+        (lambda: gym.make("Pendulum-v1"), "env = lambda: the environment has no MuJoCo model built"),
         (lambda: REACHER_ENV, "that build such a model while they are made can get motors"),
         (HiddenRobot, "env = HiddenRobot: must have MuJoCo's model and data as attributes; name"),
         (needs_scale, r"env = needs_scale: cannot be called with the arguments \{\}: .*'scale'"),
