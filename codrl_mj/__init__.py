@@ -31,8 +31,9 @@ _PUBLIC = {
     "motors_added": "codrl_mj.external_envs.building",
     "signals": "codrl_mj.engine.reading",
     "Task": "codrl_mj.tasks",
-    "EnvSource": "codrl_mj.envs.sources",
-    "register": "codrl_mj.tasks",
+    "EnvSource": "codrl_mj.envs.config",
+    "ExternalEnvSource": "codrl_mj.external_envs.sources",
+    "register": "codrl_mj.envs",
     "TrainConfig": "codrl_mj.training",
     "train": "codrl_mj.training",
     "load_policy": "codrl_mj.runs.policies",
@@ -82,6 +83,10 @@ if _is_command_line():
     signal.signal(signal.SIGINT, _exit_on_interrupt)
 # This comes before the plugin's module, which imports mujoco: mujoco then reads MUJOCO_GL.
 _choose_headless_backend()
-importlib.import_module("codrl_mj.plugin").register()
-# Importing the tasks registers them with Gymnasium.
-importlib.import_module("codrl_mj.tasks")
+importlib.import_module("codrl_mj.plugin").register(
+    # The module imports numba, so it is loaded when the first model with motors is compiled.
+    lambda: importlib.import_module("codrl_mj.engine.plugin")
+)
+# Importing the kinds of env sources registers them, and the tasks with Gymnasium.
+importlib.import_module("codrl_mj.envs.task_source")
+importlib.import_module("codrl_mj.external_envs.sources")

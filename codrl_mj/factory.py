@@ -1,21 +1,12 @@
-"""Creation of single and vectorized environments."""
+"""Creation of single and vectorized environments: `make` and `make_vec`."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium
-from gymnasium.vector import VectorEnv
-
-from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.serial import SerialVectorEnv
-from codrl_mj.envs.sources import VECTOR_ARGUMENTS, actuators_by_pattern, find_source
-from codrl_mj.external_envs import environments
+from codrl_mj.envs.config import Env, EnvConfig, VecEnv
 
 
-def make(
-    env: str | EnvConfig | Callable[..., Any], actuator: Any = None, **arguments: Any
-) -> "gymnasium.Env[Any, Any]":
+def make(env: str | EnvConfig | Callable[..., Env], actuator: Any = None, **arguments: Any) -> Env:
     """Create an environment with motors behind its actuators.
 
         >>> env = codrl_mj.make("pendulum", "maxon-dcx22l")
@@ -33,35 +24,22 @@ def make(
             in other environments. With `"ideal"`, an environment behaves, bit for bit, as it does
             without motors.
         **arguments: other fields of `EnvConfig`, options of the task or of the environment's
-            constructor, and arguments of `gymnasium.make`, such as `render_mode` and
-            `max_episode_steps`. With an `EnvConfig`, the arguments of `EnvConfig.make`.
+            constructor, and arguments of `gymnasium.make`, such as `render_mode`.
 
     Raises:
-        gymnasium.error.UnregisteredEnv: there is no such environment.
-        ValueError: a name or an argument is unknown, or arguments contradict each other; the
-            message has the remedy.
+        ValueError: there is no such environment, a name or an argument is unknown, or arguments
+            contradict each other; the message has the remedy.
     """
-    actuator_argument = {} if actuator is None else {"actuator": actuator}
-    if isinstance(env, EnvConfig):
-        return env.make(**arguments, **actuator_argument)
-    if isinstance(env, str):
-        if env_id := find_source(env).env_id:
-            return gymnasium.make(env_id, **actuator_argument, **arguments)
-        if ":" in env:
-            config, arguments = _resolve_config(env, actuator, arguments)
-            return config.make(**arguments)
-        arguments |= dict(arguments.pop("options", None) or {})
-    return environments.make(
-        env, actuators_by_pattern("default" if actuator is None else actuator), **arguments
-    )
+    config, remaining = EnvConfig.of(env, actuator, arguments)
+    return config.build(**remaining)
 
 
 def make_vec(
-    env: str | EnvConfig | Callable[..., Any],
+    env: str | EnvConfig | Callable[..., Env],
     num_envs: int = 1,
     actuator: Any = None,
     **arguments: Any,
-) -> "VectorEnv[Any, Any, Any]":
+) -> VecEnv:
     """Create a Gymnasium vector environment, by default in autoreset mode `SameStep`.
 
         >>> randomize = {"motor.resistance": "uniform(1, 2)"}
@@ -83,31 +61,6 @@ def make_vec(
     Raises:
         ValueError: see `make`; or there is too little memory.
     """
-    if not isinstance(env, EnvConfig | str):
-        vector_arguments = {
-            name: arguments.pop(name) for name in VECTOR_ARGUMENTS if name in arguments
-        }
-        return SerialVectorEnv(
-            num_envs, functools.partial(make, env, actuator, **arguments), **vector_arguments
-        )
-    config, arguments = _resolve_config(env, actuator, arguments)
-    envs: VectorEnv[Any, Any, Any] = config.make_vec(num_envs, **arguments)
-    return envs
-
-
-def _resolve_config(
-    env: str | EnvConfig, actuator: Any, arguments: dict[str, Any]
-) -> tuple[EnvConfig, dict[str, Any]]:
-    """Return a configuration, and the remaining arguments for its `make` or `make_vec`."""
-    if isinstance(env, EnvConfig):
-        config = env
-    elif ":" in env and not find_source(env).env_id:
-        # For `module:NAME` and `package:ID`, keyword arguments that are not fields are options.
-        names = "max_episode_steps", "render_mode", *VECTOR_ARGUMENTS
-        remaining_arguments = {name: arguments.pop(name) for name in names if name in arguments}
-        return EnvConfig.from_arguments(
-            env, "default" if actuator is None else actuator, arguments
-        ), remaining_arguments
-    else:
-        config = EnvConfig(env)
-    return config, arguments if actuator is None else {**arguments, "actuator": actuator}
+    config = EnvConfig.of(env)[0]
+    actuator_argument = {} if actuator is None else {"actuator": actuator}
+    return config.build_vec(num_envs, **actuator_argument, **arguments)

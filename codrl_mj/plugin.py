@@ -8,7 +8,7 @@ therefore two Python functions. When the first model calls them, the other funct
 """
 
 import ctypes
-import importlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -111,12 +111,18 @@ def check_structure(plugins: dict[str, tuple[int, Any]]) -> None:
         )
 
 
+_BACKEND: list[Callable[[], Any]] = []
+"""Function that returns the module with the compiled functions, once the plugin is registered."""
 _REFERENCES: list[Any] = []
 """Objects to whose memory MuJoCo has pointers; they must never be freed."""
 
 
-def register() -> None:
+def register(load_backend: Callable[[], Any]) -> None:
     """Register the plugin; a no-op if this module has done so before.
+
+    Args:
+        load_backend: function that returns the module with the compiled functions,
+            `codrl_mj.engine.plugin`; it is called when the first model with motors is compiled.
 
     Raises:
         LayoutError: MuJoCo's structure is not the known one.
@@ -124,6 +130,7 @@ def register() -> None:
     """
     if _REFERENCES:
         return
+    _BACKEND.append(load_backend)
     plugins = registered_plugins()
     check_structure(plugins)
     # MuJoCo itself would end the process.
@@ -150,16 +157,10 @@ def log_warning(text: str) -> None:
     library().mju_warning(f"{NAME}: {text}".replace("%", "%%").encode())
 
 
-def _compiled_backend() -> Any:
-    """Return the compiled functions' module."""
-    # Imported by name, because it is in a layer above this module.
-    return importlib.import_module("codrl_mj.engine.plugin")
-
-
 def _count_states(model: int, instance: int) -> int:
     """Number of states, `nstate`: MuJoCo's compiler calls it once, and `init` next."""
     try:
-        return _compiled_backend().num_states(model, instance)
+        return _BACKEND[0]().num_states(model, instance)
     except Exception:
         # `init` is called next, fails too, and reports the error.
         return 0
@@ -168,7 +169,7 @@ def _count_states(model: int, instance: int) -> int:
 def _start(model: int, data: int, instance: int) -> int:
     """Compile the plugin's functions, and run the compiled `init` in place of this one."""
     try:
-        return _compiled_backend().start(model, data, instance)
+        return _BACKEND[0]().start(model, data, instance)
     # An exception cannot pass through MuJoCo's C code.
     except Exception as error:
         log_warning(f"{type(error).__name__}: {error}")

@@ -6,7 +6,6 @@ dm_env is installed, except `physics`: dm_control 1.0.50 needs MuJoCo 3.
 """
 
 import copy
-import dataclasses
 import operator
 from collections.abc import Mapping
 from typing import Any
@@ -23,8 +22,6 @@ from codrl_mj.external_envs import check_dm_control
 from codrl_mj.tasks import TASKS
 
 TASK_NAME = "gym"
-_DEFAULT = object()
-"""Marker of an actuator that is not given: the task's, or a configuration's own, is used."""
 
 
 def __getattr__(name: str) -> Any:
@@ -189,7 +186,7 @@ class DmEnvironment(dm_env.Environment):
 def load(
     domain_name: Any,
     task_name: str = TASK_NAME,
-    actuator: Any = _DEFAULT,
+    actuator: Any = None,
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
     **options: Any,
@@ -199,7 +196,7 @@ def load(
     Args:
         domain_name: task name, such as `pendulum`; or an `EnvConfig`.
         task_name: `gym`.
-        actuator: as for `codrl_mj.envs.ActuatedEnv`; by default the task's or the configuration's.
+        actuator: as for `codrl_mj.make`.
         task_kwargs: `random`, as for `DmEnvironment`.
         environment_kwargs: `flat_observation`, as for `DmEnvironment`.
         **options: the other fields of `codrl_mj.envs.config.EnvConfig`, and options of the task;
@@ -210,18 +207,11 @@ def load(
     task_arguments = task_kwargs or {}
     if task_arguments.keys() - {"random"}:
         raise ValueError(f"task_kwargs = {dict(task_arguments)!r}: may only hold 'random'")
-    if isinstance(domain_name, str):
-        max_episode_steps = options.pop("max_episode_steps", None)
-        config: Any = EnvConfig.from_arguments(
-            domain_name, "default" if actuator is _DEFAULT else actuator, options
-        )
-        config = dataclasses.replace(config, max_episode_steps=max_episode_steps)
-    elif not isinstance(domain_name, EnvConfig):
+    if not isinstance(domain_name, str | EnvConfig):
         raise ValueError(
             f"domain_name = {domain_name!r}: must be a task's name or an EnvConfig; wrap other"
             " environments in DmEnvironment(...)"
         )
-    else:
-        overrides = options if actuator is _DEFAULT else {"actuator": actuator, **options}
-        config = EnvConfig.from_mapping(overrides, domain_name)
-    return DmEnvironment(config.make(), task_arguments.get("random"), **(environment_kwargs or {}))
+    config, remaining = EnvConfig.of(domain_name, actuator, options)
+    env = config.build(**remaining)
+    return DmEnvironment(env, task_arguments.get("random"), **(environment_kwargs or {}))

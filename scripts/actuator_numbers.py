@@ -90,7 +90,7 @@ def task_row(task: str, name: str) -> dict[str, Any]:
 
 @functools.cache
 def _on_a_slide(task: str) -> bool:
-    environment: Any = codrl_mj.EnvConfig(task, "ideal").make()
+    environment: Any = codrl_mj.EnvConfig(task, "ideal").build()
     model = environment.unwrapped.model
     kind = model.jnt_type[model.actuator(TASKS[task].motors[0]).trnid[0]]
     environment.close()

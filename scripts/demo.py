@@ -99,7 +99,7 @@ def main() -> int:
         policy = load_policy(out)
         for deployed in ("ideal", REAL):
             motor = named_actuator(deployed, TASK)
-            episodes = run_episodes(policy, EnvConfig(TASK, motor).make, options.episodes)
+            episodes = run_episodes(policy, EnvConfig(TASK, motor).build, options.episodes)
             evaluations[f"trained on {trained}, run on {deployed}"] = summarize(TASK, episodes)
             if deployed == REAL:
                 on_real[f"trained on {trained}"] = episodes

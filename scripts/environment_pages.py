@@ -13,8 +13,7 @@ from pathlib import Path
 
 from codrl_mj.actuators import Drive
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.sources import find_source
+from codrl_mj.envs.config import EnvConfig, find_source
 from codrl_mj.fields import field_docs
 from codrl_mj.runs.files import atomic_write
 from codrl_mj.tasks import TASKS, named_actuator

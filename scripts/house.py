@@ -67,6 +67,30 @@ def imports(module: Module, known: set[str]) -> set[str]:
     return (imported & known) - {module.name}
 
 
+def named_modules(module: Module, known: set[str]) -> set[str]:
+    """Return the package's modules that a module names in strings, as for `import_module`.
+
+    Gymnasium's entry points, `module:NAME`, count too. The package's own name is just a name.
+    """
+    texts = {
+        node.value.partition(":")[0]
+        for node in ast.walk(module.tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    return {name for name in texts & known if "." in name} - {module.name}
+
+
+def local_imports(module: Module, root: str) -> list[int]:
+    """Return the lines of imports of the package inside functions and other blocks."""
+    return [
+        node.lineno
+        for node in ast.walk(module.tree)
+        if isinstance(node, ast.ImportFrom)
+        and node.col_offset > 0
+        and (node.module or "").startswith(root)
+    ]
+
+
 def import_cycles(graph: dict[str, set[str]]) -> list[list[str]]:
     """Return the cycles of a graph, one after the other; each is cut where it was found."""
     cycles, remaining = [], {name: set(needs) for name, needs in graph.items()}
@@ -171,8 +195,22 @@ def counts(root: Path) -> tuple[dict[str, int], dict[str, list[str]]]:
         rf"(?:isinstance|issubclass)\([^()]*,\s*(?:{KINDS})\b|is_gymnasium_id\(|is_foreign\w*\(",
         everything,
     )
-    # A package that exports names of its modules does not form a cycle with them.
-    needs = {n: {m for m in names if above[n] != m and above[m] != n} for n, names in graph.items()}
+    # A package that exports names of its modules does not form a cycle with them. Other modules
+    # that are named in strings count as imported. The root package names everything.
+    hidden = {module.name: named_modules(module, names) for module in package}
+    counted["hidden"] = [
+        f"{module.name}: {', '.join(sorted(hidden[module.name]))}"
+        for module in package
+        if hidden[module.name] and module.path.stem != "__init__"
+    ]
+    counted["local_imports"] = [
+        f"{module.name}:{line}" for module in package for line in local_imports(module, root.name)
+    ]
+    needs = {
+        name: {m for m in graph[name] | hidden[name] if above[name] != m and above[m] != name}
+        for name in graph
+        if name != root.name
+    }
     counted["circles"] = [" -> ".join(circle) for circle in import_cycles(needs)]
     counted["long_files"] = [n for n in sizes if sizes[n] > FILE]
     counted["short_modules"] = [n for n in plain if sizes[n] < 60]

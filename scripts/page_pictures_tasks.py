@@ -69,7 +69,7 @@ def make(task: str, path: Path) -> None:
         env = EnvConfig(task)
         if scene.steps is not None:
             env = dataclasses.replace(env, max_episode_steps=scene.steps)
-        episodes = run_episodes(load_policy(run), env.make, 21, EVALUATION_SEED)
+        episodes = run_episodes(load_policy(run), env.build, 21, EVALUATION_SEED)
         typical = episodes[
             int(np.argsort([episode.total for episode in episodes])[len(episodes) // 2])
         ]

@@ -51,7 +51,8 @@ MODULE_NAMES = {
     "external_envs": (
         "building.motors_added",
         "dm_control.make_dm_control",
-        "gymnasium_source.GymnasiumEnvSource",
+        "sources.ExternalEnvSource",
+        "sources.GymnasiumEnvSource",
     ),
     "viz.pages": (
         *(

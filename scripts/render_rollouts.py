@@ -29,7 +29,7 @@ def main() -> None:
     for name in options.actuators:
         # A time limit of the training does not apply to the film.
         env = dataclasses.replace(trained, actuator=name, max_episode_steps=None)
-        (episode,) = run_episodes(policy, env.make, 1, options.seed)
+        (episode,) = run_episodes(policy, env.build, 1, options.seed)
         panels.append(Panel(env.task, episode, title=f"on {name}: return {episode.total:.0f}"))
     print(f"wrote {film(panels, options.out)}")
 

@@ -50,7 +50,9 @@ def row(name: str, study: ActuatorStudy) -> dict[str, object]:
     policies = [tests[f"pendulum: {name}", seed] for seed in range(study.seeds)]
     policies = [test for test in policies if finished(test.run)]
     for test in policies:
-        for episode in run_episodes(load_policy(test.run), test.env.make, test.episodes, test.seed):
+        for episode in run_episodes(
+            load_policy(test.run), test.env.build, test.episodes, test.seed
+        ):
             end = episode.state[-num_held:]
             worst.append(np.array([np.abs(upright_angle(end.T)).max(), np.abs(end[:, 1]).max()]))
     reached = np.array(worst).reshape(-1, 2)

@@ -51,8 +51,7 @@ def test_every_form_is_the_same_configuration(given):
     config = EnvConfig("cartpole", randomize=given)
     assert config.randomize == WRITTEN
     assert hash(config) == hash(EnvConfig("cartpole", randomize=RANDOMIZE))
-    arguments = config.as_arguments()["randomize"]
-    assert list(arguments.items()) == list(
+    assert list(config.distributions.items()) == list(
         RANDOMIZE.items()
     )  # the order too: it is that of the draws
     written = json.loads(json.dumps(config.as_mapping()))
@@ -64,7 +63,7 @@ def test_every_form_is_the_same_configuration(given):
 
 
 def test_environments_draw_from_it():
-    ours = EnvConfig("cartpole", randomize=WRITTEN).make()
+    ours = EnvConfig("cartpole", randomize=WRITTEN).build()
     theirs = gymnasium.make("codrl_mj/CartPole-v0", randomize=RANDOMIZE)
     assert ours.reset(seed=3)[1]["randomization"] == theirs.reset(seed=3)[1]["randomization"]
 
@@ -72,7 +71,7 @@ def test_environments_draw_from_it():
 def test_nothing_is_drawn_by_default():
     plain = EnvConfig("cartpole")
     assert plain.randomize is None
-    assert "randomize" not in plain.as_arguments()
+    assert not plain.distributions
     drawn = EnvConfig("cartpole", randomize=WRITTEN)
     assert drawn != plain
     assert dataclasses.replace(drawn, randomize=None) == plain
@@ -141,10 +140,8 @@ def test_a_configuration_survives_json_and_keyword_arguments(config, random):
         EnvConfig.from_mapping({name: written[name] for name in written if name not in names}, part)
         == config
     )
-    arguments = config.as_arguments()
-    arguments.pop("max_episode_steps", None)
-    again = EnvConfig.from_arguments(config.task, arguments.pop("actuator"), arguments)
-    assert again == dataclasses.replace(config, max_episode_steps=None)
+    arguments = {name: value for name, value in vars(config).items() if name != "joint_dynamics"}
+    assert EnvConfig.of(arguments.pop("task"), None, arguments) == (config, {})
 
 
 def test_every_face_is_built_from_it():
@@ -157,7 +154,7 @@ def test_every_face_is_built_from_it():
         joint={"friction": 0.1},
         options={"center_radius": 0.02},
     )
-    single, many, theirs = config.make(), make_sb3_vec_env(config, 2), suite.load(config)
+    single, many, theirs = config.build(), make_sb3_vec_env(config, 2), suite.load(config)
     for setup in (single.unwrapped.setup, many.env.setup, theirs.setup):
         plant = setup.simulation
         assert (plant.actuators, plant.inner_steps) == (config.actuators, 2)
@@ -245,7 +242,7 @@ def test_numpys_numbers_are_numbers():
     listed = EnvConfig("cartpole", action="voltage", levels=[np.float64(-1), np.int64(1)])
     assert json.dumps(listed.as_mapping()["levels"]) == "[-1.0, 1]"
     assert (
-        EnvConfig("cartpole", action="voltage", levels=np.array([-1.0, 1.0])).make().action_space.n
+        EnvConfig("cartpole", action="voltage", levels=np.array([-1.0, 1.0])).build().action_space.n
         == 2
     )
     for number in (np.int64(0), np.float64(2.0), np.True_):
@@ -348,7 +345,7 @@ def test_python_files_and_flags_of_the_page_run(capsys):
     assert files
     assert commands
     for content in map(yaml.safe_load, files):
-        env = EnvConfig(content["task"], **content["env"]).make()
+        env = EnvConfig(content["task"], **content["env"]).build()
         assert env.reset(seed=0)[1]["randomization"].keys() > content["env"]["randomize"].keys()
     for command in commands:
         words = iter(shlex.split(command.replace("\\\n", "")))
@@ -357,4 +354,4 @@ def test_python_files_and_flags_of_the_page_run(capsys):
             "cartpole",
             randomize=[*itertools.takewhile(lambda word: not word.startswith("--"), words)],
         )
-        assert len(config.as_arguments()["randomize"]) == 2
+        assert len(config.distributions) == 2

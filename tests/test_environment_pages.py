@@ -15,8 +15,7 @@ from PIL import Image
 import environment_pages
 import page_pictures_tasks
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.sources import find_source
+from codrl_mj.envs.config import EnvConfig, find_source
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import every_rebuilt
 

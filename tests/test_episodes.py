@@ -37,7 +37,7 @@ class Leaner:
 
 
 def cartpole(actuator="weaker", **options):
-    return EnvConfig("cartpole", actuator, **options).make
+    return EnvConfig("cartpole", actuator, **options).build
 
 
 def assert_same(first, second):
@@ -86,7 +86,7 @@ def test_episodes_equal_stepping_one_environment_at_a_time(task, actuator):
     """Compare observations, states, rewards, signals and every integration step of the trace."""
     definition, family = TASKS[task], {"ideal": Ideal, "paper": DCMotorActuator}[actuator]
     count = max(3, definition.motor_inner_steps)
-    make = EnvConfig(task, actuator, inner_steps=count, max_episode_steps=60).make
+    make = EnvConfig(task, actuator, inner_steps=count, max_episode_steps=60).build
     for seed, episode in enumerate(
         run_episodes(Leaner(definition.action_space), make, 4, seed=10), 10
     ):
@@ -163,7 +163,7 @@ def test_episodes_record_the_random_actuator_and_the_command():
     drawn = {"motor.resistance": Uniform(0.5, 2.0)}
     make = EnvConfig(
         "pendulum", "paper", randomize=drawn, action="current", max_episode_steps=3
-    ).make
+    ).build
     policy = RandomPolicy(make().action_space)
     episodes = run_episodes(policy, make, 4)
     resistances = [episode.actuator.motor.resistance for episode in episodes]
@@ -238,7 +238,7 @@ SPECIAL = {"motor": {"arm_radius": 0.1}, "controller": {"max_voltage": float("in
 
 def swing(actuator="ideal"):
     (episode,) = run_episodes(
-        RandomPolicy("pendulum"), EnvConfig("pendulum", actuator, max_episode_steps=7).make, 1
+        RandomPolicy("pendulum"), EnvConfig("pendulum", actuator, max_episode_steps=7).build, 1
     )
     return episode
 

@@ -298,7 +298,7 @@ def test_an_angle_command_has_no_tracking_measures():
     env = EnvConfig(
         "Reacher-v5", {"joint0": Position(), "joint1": Lag(time_constant=0.1)}, max_episode_steps=4
     )
-    (episode,) = run_episodes(RandomPolicy(env.action_space, 0), env.make, 1, 3)
+    (episode,) = run_episodes(RandomPolicy(env.action_space, 0), env.build, 1, 3)
     assert episode.is_torque_controlled == (False, True)
     result = summarize(env.task, [episode])
     assert result.motors["joint0"]["tracking_rms"] is None
@@ -317,7 +317,7 @@ def test_an_angle_command_has_no_tracking_measures():
             f"joint1: {name}"
         ]
     current_only = EnvConfig("Reacher-v5", Position(), max_episode_steps=4)
-    (episode,) = run_episodes(RandomPolicy(current_only.action_space, 0), current_only.make, 1, 3)
+    (episode,) = run_episodes(RandomPolicy(current_only.action_space, 0), current_only.build, 1, 3)
     result = summarize(current_only.task, [episode])
     assert (
         result.tracking_rms
@@ -343,7 +343,7 @@ def test_a_film_shows_the_voltage_of_every_family_with_one(monkeypatch):
         strip, "_pixels", lambda figure: drawn.append(figure) or np.zeros((1, 1, 3), np.uint8)
     )
     env = EnvConfig("Reacher-v5", Position(), max_episode_steps=4)
-    (episode,) = run_episodes(RandomPolicy(env.action_space, 0), env.make, 1, 3)
+    (episode,) = run_episodes(RandomPolicy(env.action_space, 0), env.build, 1, 3)
     strip.draw_strip(env.task, episode, 0, 300, 1.0, 1.0)
     assert [text.get_text() for text in drawn[0].legends[0].get_texts()] == ["actual", "voltage"]
 
@@ -357,7 +357,7 @@ def test_the_saturated_share_counts_voltages_at_the_limit(max_voltage):
     actuator = DCMotorActuator(
         weaker.motor, CurrentLoop(kp=0.2, ki=0.2, kff=0.5, max_voltage=max_voltage)
     )
-    make = EnvConfig("cartpole", actuator, inner_steps=2).make
+    make = EnvConfig("cartpole", actuator, inner_steps=2).build
     episodes = run_episodes(Leaner(), make, episodes=3)
     voltages = np.concatenate([episode.trace["voltage"] for episode in episodes])
     summary = summarize("cartpole", episodes)
@@ -469,7 +469,7 @@ def test_every_episode_is_measured_with_its_random_motor():
     drawn = {"motor.resistance": Uniform(0.5, 3.0), "motor.arm_radius": Uniform(0.5, 2.0)}
     env = EnvConfig("pendulum", "weak", max_episode_steps=20, randomize=drawn)
     result = evaluate(RandomPolicy("pendulum"), env, episodes=3)
-    episodes = run_episodes(RandomPolicy("pendulum"), env.make, 3)
+    episodes = run_episodes(RandomPolicy("pendulum"), env.build, 3)
     arms = [episode.actuator.motor.arm_radius for episode in episodes]
     assert len(set(arms)) == 3
     single = [summarize("pendulum", [episode]) for episode in episodes]
@@ -534,17 +534,17 @@ def test_an_evaluation_is_json_with_a_unit_for_every_measure():
 
 def test_a_policy_is_not_measured_where_its_observations_or_actions_are_others():
     policy = RandomPolicy("pendulum")
-    policy.action_space = EnvConfig("pendulum", action="voltage").make().action_space
+    policy.action_space = EnvConfig("pendulum", action="voltage").build().action_space
     with pytest.raises(
         ValueError,
         match=r"action_space: the policy was trained with Box.*but the environment has",
     ):
         evaluate(policy, EnvConfig("pendulum"), episodes=1)
     policy.action_space = None
-    policy.observation_space = EnvConfig("cartpole").make().observation_space
+    policy.observation_space = EnvConfig("cartpole").build().observation_space
     for run in (
         lambda env: evaluate(policy, env, episodes=1),
-        lambda env: run_episodes(policy, env.make, 1),
+        lambda env: run_episodes(policy, env.build, 1),
         lambda env: record(policy, env, 0, 64, 48),
     ):
         with pytest.raises(ValueError, match=r"observation_space: the policy was trained with Box"):

@@ -39,7 +39,7 @@ REACHER = {".*": "lag"}
             lambda: gym.make("codrl_mj/Pendulum-v0", actuator="weak"),
         ),
         (("InvertedPendulum-v5",), lambda: gym.make("InvertedPendulum-v5")),
-        (("Reacher-v5", "lag"), lambda: codrl_mj.EnvConfig("Reacher-v5", REACHER).make()),
+        (("Reacher-v5", "lag"), lambda: codrl_mj.EnvConfig("Reacher-v5", REACHER).build()),
         (("Reacher-v5", REACHER), lambda: codrl_mj.make("Reacher-v5", Lag())),
         (
             (functools.partial(gym.make, "Reacher-v5"), "lag"),
@@ -184,12 +184,15 @@ REACHER_ENV = gym.make("Reacher-v5")
         (lambda: mujoco.MjSpec(), "add motors to a MjSpec with codrl_mj.add_motors"),
         (lambda: codrl_mj.make("Reacher-v5", "lag"), "which has motors already; pass its name"),
         (lambda: codrl_mj.make("pendulum"), "which has motors already; pass its name"),
-        (lambda: gym.make("Pendulum-v1"), "env = lambda: the environment has no MuJoCo model built"),
+        (
+            lambda: gym.make("Pendulum-v1"),
+            "env = lambda: the environment has no MuJoCo model built",
+        ),
         (lambda: REACHER_ENV, "that build such a model while they are made can get motors"),
         (HiddenRobot, "env = HiddenRobot: must have MuJoCo's model and data as attributes; name"),
         (needs_scale, r"env = needs_scale: cannot be called with the arguments \{\}: .*'scale'"),
-        (REACHER_ENV, "must be an id, or a function .*; pass a function instead"),
-        (None, "env = None: must be an id, or a function or class that makes an environment"),
+        (REACHER_ENV, "or a function .*; pass a function instead"),
+        (None, "env = None: must be a task's name, the id of an environment"),
     ],
 )
 def test_raises_if_a_function_makes_no_environment_with_a_model(env, message):

@@ -21,7 +21,7 @@ ALLOWED = {
     "tasks": {"actuators", "fields", "user_code"},
     "catalogue": {"fields", "user_code"},
     "plugin": set(),
-    "__init__": {"plugin", "tasks"},
+    "__init__": {"plugin"},
     "compile_cache": set(),
     "engine": {"actuators", "fields", "compile_cache", "user_code", "plugin"},
     "physics": {
@@ -34,8 +34,15 @@ ALLOWED = {
         "tasks",
     },
     "envs.distributions": {"fields"},
-    "envs.sources": {"actuators", "engine", "user_code", "tasks"},
-    "envs.config": {"actuators", "disturbances", "envs.distributions", "envs.sources", "fields"},
+    "envs.patterns": {"actuators"},
+    "envs.config": {
+        "actuators",
+        "disturbances",
+        "envs.distributions",
+        "fields",
+        "tasks",
+        "user_code",
+    },
     "envs": {
         *(
             "actuators",
@@ -43,7 +50,7 @@ ALLOWED = {
             "engine",
             "envs.config",
             "envs.distributions",
-            "envs.sources",
+            "envs.patterns",
             "fields",
         ),
         *("compile_cache", "user_code", "physics", "tasks"),
@@ -59,9 +66,9 @@ ALLOWED = {
             "fields",
             "physics",
         ),
-        *("envs.sources", "user_code", "tasks"),
+        *("envs.patterns", "user_code", "tasks"),
     },
-    "factory": {"envs", "envs.config", "envs.sources", "external_envs"},
+    "factory": {"envs.config"},
     "suite": {"actuators", "envs", "envs.config", "external_envs", "physics", "tasks"},
     "agents": {
         "actuators",
@@ -74,7 +81,7 @@ ALLOWED = {
     },
     "runs": set(),
     "runs.files": set(),
-    "runs.summaries": {"actuators", "envs.sources", "fields", "runs.files", "runs", "tasks"},
+    "runs.summaries": {"actuators", "envs.patterns", "fields", "runs.files", "runs", "tasks"},
     "runs.policies": {"actuators", "agents", "envs.config", "runs.files", "runs"},
     "evaluation.measures": set(),
     "evaluation": {
@@ -82,7 +89,6 @@ ALLOWED = {
             "actuators",
             "envs",
             "envs.config",
-            "envs.sources",
             "evaluation.measures",
             "fields",
             "physics",
@@ -91,11 +97,14 @@ ALLOWED = {
         *("runs.policies", "tasks"),
     },
     "deploy": {
-        *("actuators", "agents", "engine", "envs.config", "evaluation", "fields", "compile_cache"),
+        *("actuators", "agents", "engine", "envs", "envs.config", "evaluation", "fields"),
+        "compile_cache",
         *("runs.files", "runs.policies", "tasks", "user_code"),
     },
     "viz": set(),
+    "viz.scene": {"envs", "envs.config", "physics", "user_code"},
     "viz.films": {
+        "viz.scene",
         "actuators",
         "envs",
         "envs.config",
@@ -104,7 +113,7 @@ ALLOWED = {
         "runs.files",
         "tasks",
     },
-    "viz.replay": {"envs", "envs.config", "evaluation", "runs.files"},
+    "viz.replay": {"envs.config", "evaluation", "runs.files", "viz.scene"},
     "viz.view": {"actuators", "envs.config", "evaluation", "fields", "viz.replay"},
     "training": {
         *(
@@ -170,6 +179,7 @@ ALLOWED = {
         *(
             "viz.pages.plots",
             "viz.replay",
+            "viz.scene",
             "runs.files",
             "runs",
             "runs.policies",
@@ -186,7 +196,6 @@ ALLOWED = {
             "catalogue",
             "disturbances",
             "envs.config",
-            "envs.sources",
             "evaluation",
         ),
         *("deploy", "evaluation.measures", "fields", "viz.films", "compile_cache", "user_code"),

@@ -36,7 +36,7 @@ SIGNALS = signal_names(DCMotorActuator)
 def random_panel(task="cartpole", actuator="weaker", steps=20, seed=1):
     """Return a panel with an episode of random actions of at most `steps` steps."""
     env = EnvConfig(task, named_actuator(actuator, task), max_episode_steps=steps)
-    (episode,) = run_episodes(RandomPolicy(task, seed), env.make, 1, seed)
+    (episode,) = run_episodes(RandomPolicy(task, seed), env.build, 1, seed)
     return Panel(task, episode, title=f"{task} on {actuator}")
 
 
@@ -388,7 +388,7 @@ def test_a_failure_midway_keeps_the_old_file_and_frees_the_contexts(
 
 def test_an_environment_without_images_is_refused_before_its_episode():
     with (
-        contextlib.closing(EnvConfig("pendulum").make()) as env,
+        contextlib.closing(EnvConfig("pendulum").build()) as env,
         pytest.raises(ValueError, match="'rgb_array' for a film"),
     ):
         FrameRecorder(env)

@@ -84,7 +84,7 @@ def test_raises_for_too_many_parallel_episodes():
         ValueError,
         match=r"episodes = 1,000,000, which run side by side: needs about 100 GB .*; run fewer",
     ):
-        run_episodes(RandomPolicy("cartpole"), env.make, 1_000_000)
+        run_episodes(RandomPolicy("cartpole"), env.build, 1_000_000)
     with pytest.raises(ValueError, match="evaluation_episodes = 0: must be >= 1"):
         check_episodes(0, "evaluation_episodes")
     check_episodes(100)
@@ -99,7 +99,7 @@ def test_an_endless_episode_stops_before_the_memory_is_full(monkeypatch):
     with pytest.raises(
         ValueError, match=r"an episode of 50 steps, which does not end: .*; lower max_episode_steps"
     ):
-        run_episodes(RandomPolicy("pendulum"), env.make, 1)
+        run_episodes(RandomPolicy("pendulum"), env.build, 1)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_an_endless_episode_stops_before_the_memory_is_full(monkeypatch):
 )
 @pytest.mark.usefixtures("small")
 def test_raises_if_agents_buffers_are_too_large(agent, sizes, message):
-    space = EnvConfig("pendulum").make()
+    space = EnvConfig("pendulum").build()
     many = type("Many", (), {"num_envs": 1, "observation_space": space.observation_space})()
     many.action_space = space.action_space
     assert np.prod(space.observation_space.shape) == 3

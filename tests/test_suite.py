@@ -86,14 +86,14 @@ def test_options_replace_those_of_a_configuration():
     assert overridden.setup.config.actuator == named_actuator("weaker", "cartpole")
     assert overridden.setup.inner_steps == 2
     assert overridden.setup.config.options == (0.5, True)
-    assert suite.load(config, actuator=None).setup.config.actuator == IDEAL
+    assert suite.load(config, actuator="ideal").setup.config.actuator == IDEAL
     overridden.reset(), same.reset()
     assert [sum(not env.step(0).last() for _ in range(7)) for env in (overridden, same)] == [6, 6]
     limited = suite.load("pendulum", "gym", max_episode_steps=5)
     limited.reset()
     assert [limited.step([0.0]).last() for _ in range(5)] == [False] * 4 + [True]
     with pytest.raises(
-        ValueError, match=r"unknown key env\.innersteps; did you mean env\.inner_steps"
+        ValueError, match="unknown option 'innersteps' of cartpole: did you mean 'inner_steps'"
     ):
         suite.load(config, innersteps=2)
 
@@ -372,7 +372,7 @@ def test_any_gymnasium_environment_keeps_the_contract(env_id):
         config = EnvConfig(
             env_id, {".*": "lag"}, randomize={".*": {"time_constant": "uniform(0.01, 0.02)"}}
         )
-        env, theirs = suite.load(config, task_kwargs={"random": 4}), config.make()
+        env, theirs = suite.load(config, task_kwargs={"random": 4}), config.build()
         assert env.physics.named.data.qpos["rootz"] == env.data.qpos[1]
         assert env.control_timestep() == env.dt == 0.008
     else:

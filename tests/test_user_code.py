@@ -18,7 +18,6 @@ from codrl_mj.cli.environments import build_env_config
 from codrl_mj.engine import load_family
 from codrl_mj.engine.families import compiled_observe
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.external_envs import environments
 from codrl_mj.physics.compiled_task import compiled_constrain, compiled_outcomes
 from codrl_mj.user_code import read_yaml
 from tests import slips
@@ -203,11 +202,6 @@ def reset(task, **options):
             codrl_mj.add_motors,
             ("arm.xml", {}),
             r"spec = 'arm\.xml': must be .* mujoco\.MjSpec\.from_file\('arm\.xml'\)",
-        ),
-        (
-            environments.make,
-            ("codrl_mj/Pendulum-v0", {}),
-            r"codrl_mj/Pendulum-v0: .* gymnasium\.make\('codrl_mj/Pend",
         ),
         (
             lambda: reset("Pendulum", xinit=0.1),

@@ -3,11 +3,12 @@
 import argparse
 import dataclasses
 import itertools
+import json
 import typing
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import tyro
 
@@ -21,10 +22,10 @@ from codrl_mj.actuators import (
     identified_ranges,
     override_actuator,
 )
-from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.sources import find_source, is_source_name
+from codrl_mj.envs.config import EnvConfig, EnvSource, find_source, is_source_name
 from codrl_mj.fields import field_docs, nested_types
 from codrl_mj.runs import CONFIG
+from codrl_mj.tasks import TASKS
 from codrl_mj.user_code import allow_imports_from_files, read_yaml
 
 
@@ -134,7 +135,7 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
             ],
             value,
         )
-        for option, hint, text, value in source.option_flags(defaults)
+        for option, hint, text, value in _option_flags(defaults)
     ]
     env_flags = flag_dataclass(EnvConfig, defaults, excluded, options)
     family = type(defaults.actuators[0])
@@ -255,7 +256,7 @@ def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> En
         for nested_part in ("disturbances", "joint")
         if nested_part in fields
     }
-    options = source.options_of(env_flags)
+    options = parse_options(source, env_flags)
     patterns = _patterns(verb.actuators)
     fields["randomize"] = _ranges(fields["randomize"], name, patterns)
     actuators = (
@@ -324,3 +325,59 @@ def _set_fields(fields: Any) -> dict[str, Any]:
         for name, value in vars(fields).items()
         if value is not None
     }
+
+
+class OptionFlag(NamedTuple):
+    """Flag of an environment's option."""
+
+    name: str
+    annotation: Any
+    """Type of its value, as for tyro."""
+    help: str
+    default: Any
+
+
+def _option_flags(config: EnvConfig) -> list[OptionFlag]:
+    """Return the flags of all tasks' options, or the single flag of a third-party environment's.
+
+    A task has the flags of all tasks, so that messages can name another task's flag.
+    """
+    options = config.source.non_default_options(config.options)
+    if config.source.task is None:
+        values = tuple(f"{name}={json.dumps(value)}" for name, value in options.items())
+        description = (
+            "Keyword arguments of the environment, such as frame_skip=2: their values as JSON, or"
+            " else as text."
+        )
+        return [OptionFlag("options", tuple[str, ...], description, values)]
+    option_types: dict[str, Any] = {name: task.options for name, task in TASKS.items()}
+    return [
+        OptionFlag(
+            option,
+            hint | None,
+            f"{name}: {field_docs(option_type)[option]}",
+            options.get(option),
+        )
+        for name, option_type in option_types.items()
+        for option, hint in typing.get_type_hints(option_type).items()
+    ]
+
+
+def parse_options(source: EnvSource, flags: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options from the values of their flags.
+
+    Raises:
+        ValueError: an item is not NAME=VALUE.
+    """
+    if source.task is not None:
+        return {name: value for name, value in flags.items() if value is not None}
+    options = {}
+    for item in flags["options"]:
+        name, separator, text = item.partition("=")
+        if not separator or not name:
+            raise ValueError(f"--env.options {item}: must be NAME=VALUE")
+        try:
+            options[name] = json.loads(text)
+        except ValueError:
+            options[name] = text
+    return options

@@ -17,8 +17,7 @@ from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, with_environment
 from codrl_mj.cli.parsing import Trust
 from codrl_mj.cli.subject import Source, policy_and_environment
 from codrl_mj.cli.terminal import progress_bar
-from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.sources import is_source_name
+from codrl_mj.envs.config import EnvConfig, is_source_name
 from codrl_mj.fields import did_you_mean
 from codrl_mj.runs import unique_names
 
@@ -125,7 +124,7 @@ class Replay(EpisodeVerb):
         from codrl_mj.viz.replay import motion_of_episode, write_replay
 
         policy, env, title = policy_and_environment(self)
-        (episode,) = run_episodes(policy, env.make, 1, self.seed)
+        (episode,) = run_episodes(policy, env.build, 1, self.seed)
         title = f"{title}: return {episode.total:.0f}"
         write_replay(motion_of_episode(episode, env), self.out, title)
         print(

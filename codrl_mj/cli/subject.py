@@ -8,8 +8,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from codrl_mj.cli.environments import build_env_config
-from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.sources import is_source_name
+from codrl_mj.envs.config import EnvConfig, check_time_limit, is_source_name
 from codrl_mj.fields import did_you_mean
 from codrl_mj.runs import CONFIG, finished
 from codrl_mj.tasks import TASKS
@@ -151,11 +150,12 @@ def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig, str]:
         else verb.source.load(Path(verb.subject))
     )
     env = build_env_config(verb, subject.env.task, verb.actuator_name, subject.env)
+    check_time_limit(env)
     subject.check_interface(env)
     policy = subject.policy
     if is_random:
         from codrl_mj.evaluation import RandomPolicy
 
-        with contextlib.closing(env.make()) as sample_env:
+        with contextlib.closing(env.build()) as sample_env:
             policy = RandomPolicy(sample_env.action_space, verb.seed)
     return policy, env, f"{Path(verb.subject).name} on {env.actuator_label}"

@@ -22,11 +22,12 @@ from codrl_mj.cli.environments import (
     build_env_config,
     environment_fields,
     flag_dataclass,
+    parse_options,
     scan_flags,
 )
 from codrl_mj.cli.parsing import AsJson
 from codrl_mj.cli.terminal import print_text, progress_bar
-from codrl_mj.envs.sources import find_source
+from codrl_mj.envs.config import find_source
 from codrl_mj.fields import command
 from codrl_mj.runs import PROGRESS, RESULT, finished
 from codrl_mj.runs.files import read_json
@@ -195,7 +196,7 @@ class Train:
         prepare_run(out, config, self.resume is not None, self.accept_changes)
         # Build the environment once, so that an invalid setting is reported before the progress bar
         # starts.
-        config.env.make().close()
+        config.env.build().close()
         print_text(*dict.fromkeys(actuator.assumed for actuator in config.env.actuators))
         with training_bars({f"{config.agent.name.upper()} on {config.task}": (config, out)}):
             train(
@@ -300,7 +301,7 @@ def _base_config(chosen: argparse.Namespace) -> TrainConfig:
         return read_config(Path(chosen.config), chosen.trust, **overrides)
     task = chosen.task or "cartpole"
     source = find_source(task)
-    options = source.options_of({"options": chosen.options}) if chosen.options else {}
+    options = parse_options(source, {"options": chosen.options}) if chosen.options else {}
     agent = (
         chosen.agent
         if chosen.agent in AGENTS or ":" in str(chosen.agent)

@@ -242,7 +242,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
         for index in range(count):
             # A late answer must not apply a command of the previous episode.
             self._last = self._safe
-            finished += run_episodes(self, self.rig.make, 1, seed + index)
+            finished += run_episodes(self, self.rig.build, 1, seed + index)
             on_episode(len(finished))
         return finished
 
@@ -416,7 +416,7 @@ def board_test(
         on_board = board.episodes(episodes, seed, on_episode)
         rate = (board.frames + board.samples) / (time.perf_counter() - start)
         counts = board.frames, board.samples, board.refused, board.beyond_limits, board.unanswered
-    in_python = run_episodes(OnnxPolicy(folder), env.make, episodes, seed)
+    in_python = run_episodes(OnnxPolicy(folder), env.build, episodes, seed)
     return BoardTest(
         on_board, in_python, *counts, rate, instructions(folder) if target == "cortex-m4f" else None
     )

@@ -113,7 +113,7 @@ def compare(
                 " convert the log"
             )
     simulated, actions = [], interface.to_actions(commands)
-    with contextlib.closing(simulated_env.make()) as wrapped:
+    with contextlib.closing(simulated_env.build()) as wrapped:
         simulation: Any = wrapped.unwrapped
         if (task := getattr(simulation, "task", None)) is None:
             raise ValueError(

@@ -21,6 +21,7 @@ import numpy as np
 from codrl_mj.actuators import allow_imports, mapping_of
 from codrl_mj.deploy.loops import loop_parameters
 from codrl_mj.deploy.network import extract_network
+from codrl_mj.deploy.spaces import describe_spaces
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
 from codrl_mj.fields import check_names, did_you_mean, differences
@@ -87,9 +88,9 @@ class Interface:
     @classmethod
     def from_env(cls, env: EnvConfig) -> "Interface":
         """Return the interface of an environment."""
-        with contextlib.closing(env.make()) as instance:
+        with contextlib.closing(env.build()) as instance:
             rate = 1.0 / _step_duration(instance)
-        return cls(env.task, rate, *env.source.interface(env))
+        return cls(env.task, rate, *describe_spaces(env))
 
     @property
     def levels(self) -> np.ndarray | None:
@@ -208,10 +209,12 @@ class Contract(Interface):
         """
         network = extract_network(policy)
         # The bounds of the actions scale the exported commands.
-        golden_episodes = run_episodes(policy, env.make, episodes, seed, same_bounds=True)
+        golden_episodes = run_episodes(policy, env.build, episodes, seed, same_bounds=True)
         # A policy that fails at once has short episodes.
         while sum(len(episode.time) for episode in golden_episodes) < NUM_GOLDEN:
-            golden_episodes += run_episodes(policy, env.make, episodes, seed + len(golden_episodes))
+            golden_episodes += run_episodes(
+                policy, env.build, episodes, seed + len(golden_episodes)
+            )
         observations = np.concatenate([episode.observation[:-1] for episode in golden_episodes])
         golden_observations = observations[
             np.unique(np.linspace(0, len(observations) - 1, NUM_GOLDEN).astype(int))

@@ -41,7 +41,7 @@ def loop_parameters(env: EnvConfig) -> dict[str, Any] | None:
     }
     if type(first) is DCMotorActuator:
         # The paper's loop is sampled at the engine's step, which only the model knows.
-        with contextlib.closing(env.make()) as instance:
+        with contextlib.closing(env.build()) as instance:
             model = getattr(instance.unwrapped, "model", None)
         return (
             None

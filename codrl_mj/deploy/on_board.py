@@ -180,7 +180,7 @@ def _replace_globals(function: Any, **replacements: Any) -> Any:
 
 
 # A copy of the module, in which `advance_motor` calls this module's `advance_winding`.
-_shaft = ModuleType("codrl_mj.actuators.shaft")
+_shaft = ModuleType(shaft.__name__)
 vars(_shaft).update(
     vars(shaft),
     advance_motor=_replace_globals(shaft.advance_motor, advance_winding=advance_winding),

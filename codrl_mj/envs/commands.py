@@ -13,6 +13,7 @@ from codrl_mj.disturbances import NO_DISTURBANCES, Disturbances, check_delay
 from codrl_mj.engine.reading import actuators_sharing_motor
 from codrl_mj.engine.reading import motors as motors_of
 from codrl_mj.engine.specs import ON_JOINT
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
 
@@ -42,6 +43,14 @@ def command_of(actuator: ActuatorModel, name: str, pattern: str = "") -> Command
     return command._replace(
         fixed={field: f"with action={name!r} {reason}" for field, reason in command.fixed.items()}
     )
+
+
+def commands_by_pattern(config: EnvConfig) -> dict[str, Command]:
+    """Return motor, or pattern of motors, -> command that an action represents for it."""
+    return {
+        pattern: command_of(actuator, config.action, pattern)
+        for pattern, actuator in config.actuators_by_name.items()
+    }
 
 
 def _servo_remedy(actuator: ActuatorModel, name: str) -> str:

@@ -1,22 +1,228 @@
-"""Complete configuration of an environment; it builds environments and is stored in run folders.
+"""Configuration of an environment, and the interface of the sources that build it.
 
-The command line derives its flags from the fields. Importing this module is fast: it compiles
-nothing and does not load MuJoCo.
+    name, function or source -> EnvConfig -> build(): an environment with motors
+
+The command line derives its flags from the fields of `EnvConfig`. Importing this module is fast: it
+compiles nothing and does not load MuJoCo.
 """
 
+import abc
 import dataclasses
-from collections.abc import Mapping
+import json
+import os
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import VectorEnv
 
-from codrl_mj.actuators import ActuatorModel, combined_name, mapping_of
+from codrl_mj.actuators import ActuatorModel, DCMotorActuator, combined_name, mapping_of
 from codrl_mj.disturbances import NO_DISTURBANCES, UNMODIFIED_JOINT, Disturbances, Joint, resolve
 from codrl_mj.envs.distributions import Distribution, parse_randomize
-from codrl_mj.envs.sources import EnvSource, find_source, options_mapping
 from codrl_mj.fields import check_joint_dynamics, check_names
+from codrl_mj.tasks import Task, find_task, reference_of
+from codrl_mj.user_code import load_object
+
+Env = gymnasium.Env[Any, Any]
+"""Environment; observations and actions may be of any type."""
+VecEnv = VectorEnv[Any, Any, Any]
+"""Vector environment; observations, actions and their arrays may be of any type."""
+COMMON_FIELDS = (
+    *("task", "actuator", "action", "observe_actuator", "max_episode_steps", "allow_unstable"),
+    *("disturbances", "randomize", "options"),
+)
+"""Fields of an `EnvConfig` that every source has."""
+
+
+class EnvSource(abc.ABC):
+    """Origin of environments: how to make them, and which actuators and options they have.
+
+    A task, a Gymnasium id and a function that makes environments are sources of this package.
+    """
+
+    name: str
+    """Name in messages."""
+    fields: tuple[str, ...] = (*COMMON_FIELDS, "joint_dynamics")
+    """Fields of an `EnvConfig` that it supports; others must stay at their defaults."""
+    option_names: tuple[str, ...] = ()
+    """Names of its options; empty if its environments take any keyword arguments."""
+    time_limit: int | None = None
+    """Maximum length of an episode [environment steps]; None for no limit."""
+    default_actuator: str = "ideal"
+    """Actuator of its motors if the configuration names none."""
+    paper: tuple[DCMotorActuator, ...] = ()
+    """Actuators from which the named ones (`paper`, `weak`, ...) are derived; empty if none."""
+    task: Task | None = None
+    """The task, if its environments are those of a task of this package."""
+
+    @property
+    def reference(self) -> str:
+        """Name by which `find_source` finds it in any process."""
+        return reference_of(self, type(self).__module__)
+
+    @abc.abstractmethod
+    def make(self, config: "EnvConfig", **arguments: Any) -> Env:
+        """Make an environment whose motors the package can record.
+
+        Args:
+            config: its configuration.
+            **arguments: `render_mode`, and other arguments of the environment that are no fields of
+                the configuration.
+
+        Raises:
+            ValueError: the configuration does not fit the model.
+        """
+
+    @abc.abstractmethod
+    def make_vec(self, config: "EnvConfig", num_envs: int, **arguments: Any) -> VecEnv:
+        """Make a vector environment, by default in autoreset mode `SameStep`.
+
+        Args:
+            config: the configuration of its environments.
+            num_envs: number of environments, >= 1.
+            **arguments: those of `make`, and `num_threads` and `autoreset_mode`.
+
+        Raises:
+            ValueError: see `make`.
+        """
+
+    @abc.abstractmethod
+    def action_space(self, config: "EnvConfig") -> "gymnasium.spaces.Space[Any]":
+        """Return the action space without motors; other commands change its bounds or size."""
+
+    @abc.abstractmethod
+    def actuators(self, actuator: Any) -> Any:
+        """Return the user's `actuator` as the configuration stores it.
+
+        Raises:
+            ValueError: it is not an actuator, or one of its values is out of bounds.
+        """
+
+    @abc.abstractmethod
+    def actuators_by_name(self, actuators: Any) -> dict[str, ActuatorModel]:
+        """Return motor, or pattern of motors, -> actuator from the result of `actuators`."""
+
+    @abc.abstractmethod
+    def override_actuators(
+        self, config: "EnvConfig", patterns: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Return motor, or pattern, -> actuator: `patterns`, and the configuration's for the rest.
+
+        Args:
+            config: the configuration.
+            patterns: pattern of motors' names -> actuator that replaces the configuration's.
+        """
+
+    def options(self, options: Any) -> Any:
+        """Return options as the configuration stores them: as a mapping that JSON can hold.
+
+        Raises:
+            ValueError: the options are not such a mapping.
+        """
+        try:
+            json_options = json.loads(json.dumps(dict(options or {})))
+            if reserved_names := {"render_mode", *self.fields} & json_options.keys():
+                raise ValueError(f"{reserved_names.pop()!r} is not an argument of the environment")
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"options = {options!r}: must be a mapping that JSON can hold ({error}); register"
+                " an environment that needs other arguments under its own id"
+            ) from None
+        return json_options
+
+    def non_default_options(self, options: Any) -> dict[str, Any]:
+        """Return the options that differ from their defaults, by name."""
+        return dict(options)
+
+    def code(self, options: Any) -> set[str | Path]:
+        """Return names of modules and paths of files with its code; options may name files."""
+        option_values = [
+            value for value in self.non_default_options(options).values() if isinstance(value, str)
+        ]
+        # `Path.is_file` would raise for a long text, which is not a file name.
+        files = (Path(value).resolve() for value in option_values if os.path.isfile(value))  # noqa: PTH113
+        return {type(self).__module__, *files}
+
+
+class SourceKind(NamedTuple):
+    """Kind of env sources; `SOURCE_KINDS` has the built-in ones."""
+
+    claims: Callable[[str], bool]
+    """Function that returns True if a name is of this kind, such as a Gymnasium id."""
+    find: Callable[[str], EnvSource]
+    """Function that returns the source of a name that the kind claims."""
+    wrap: Callable[[Any, str | None], EnvSource | None]
+    """Function that returns the source of an object, such as a task; None if it is of another kind.
+    Its second argument is the object's `module:NAME`, if it was loaded by it.
+    """
+
+
+SOURCE_KINDS: list[SourceKind] = []
+"""Kinds of sources. `import codrl_mj` imports the modules that register them, because these modules
+import this one.
+"""
+
+
+def find_source(env: Any) -> EnvSource:
+    """Return the source of an environment.
+
+    Args:
+        env: a task's name, an environment's id, `module:NAME` of a task, a source or a function
+            that makes environments; or such an object itself.
+
+    Raises:
+        ValueError: there is no such source.
+    """
+    target, name = env, None
+    if isinstance(env, str):
+        for kind in SOURCE_KINDS:
+            if kind.claims(env):
+                return kind.find(env)
+        # An unknown name without a colon is taken for a task's: the error lists the tasks.
+        target, name = (load_object(env) if ":" in env else find_task(env)), env
+    if isinstance(target, EnvSource):
+        if not isinstance(getattr(target, "name", None), str):
+            raise ValueError(
+                f"{type(target).__qualname__}: must have a `name`, the text that messages use"
+            )
+        return target
+    if isinstance(target, type) and issubclass(target, EnvSource | Task):
+        raise ValueError(
+            f"{target.__qualname__}: must be an instance of it: {target.__qualname__}(...)"
+        )
+    for kind in SOURCE_KINDS:
+        if (source := kind.wrap(target, name)) is not None:
+            return source
+    raise ValueError(
+        f"env = {target!r}: must be a task's name, the id of an environment, module:NAME, a"
+        " codrl_mj.Task, a codrl_mj.EnvSource, or a function or class that makes an environment;"
+        " pass a function instead of an environment, such as lambda: gymnasium.make(ID)"
+    )
+
+
+def is_source_name(name: str) -> bool:
+    """Return True if a text has the form of a source's name, such as any `module:NAME`.
+
+    The path of an existing folder does not count, even if it looks like a Gymnasium id
+    (`runs/swing-v2`).
+    """
+    if re.fullmatch(r"[\w.]+:[\w.]+", name) is not None:
+        return True
+    is_folder = "/" in name and Path(name).is_dir()
+    return not is_folder and any(kind.claims(name) for kind in SOURCE_KINDS)
+
+
+def options_mapping(options: Any) -> dict[str, Any]:
+    """Return options as keyword arguments, from a mapping, a task's `NamedTuple` or None."""
+    try:
+        return options._asdict() if hasattr(options, "_asdict") else dict(options or {})
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"options = {options!r}: must be a mapping of option names to values"
+        ) from None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,10 +235,10 @@ class EnvConfig:
             environment is built.
     """
 
-    task: str
+    task: Any
     """Task name, such as `cartpole`; the Gymnasium id of a third-party environment, such as
-    `HalfCheetah-v5` (`package:ID` imports the package first); or `module:NAME` of a custom task or
-    env source.
+    `HalfCheetah-v5` (`package:ID` imports the package first); or `module:NAME` of a custom task, of
+    a function that makes environments, or of an env source. In Python also such an object itself.
     """
     actuator: Any = "default"
     """Actuator that delivers the force. A name (`default`: the task's default, which is the paper's
@@ -100,7 +306,10 @@ class EnvConfig:
             field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)
         }
         source = find_source(values["task"])
-        values |= {"task": source.reference, "joint": resolve(values["joint"], UNMODIFIED_JOINT)}
+        # Only a function or a source may have no name, and is stored itself.
+        is_named = isinstance(values["task"], str) or source.task is not None
+        task = source.reference if is_named else values["task"]
+        values |= {"task": task, "joint": resolve(values["joint"], UNMODIFIED_JOINT)}
         values["disturbances"] = resolve(values["disturbances"], NO_DISTURBANCES)
         for field in dataclasses.fields(self):
             if field.name not in source.fields and values[field.name] != field.default:
@@ -129,32 +338,23 @@ class EnvConfig:
         vars(self).update(values)
 
     @classmethod
-    def from_arguments(cls, task: str, actuator: Any, arguments: Mapping[str, Any]) -> "EnvConfig":
-        """Create a configuration from keyword arguments of an environment class.
+    def of(
+        cls, env: Any, actuator: Any = None, arguments: Mapping[str, Any] | None = None
+    ) -> tuple["EnvConfig", dict[str, Any]]:
+        """Return an environment's configuration, and the arguments that are not part of it.
 
         Args:
-            task: name of the task or env source.
-            actuator: value of the field of this name.
-            arguments: other fields, and options, by name or in the mapping `options`. The time
-                limit must not be among them: the caller applies it.
+            env: a configuration, or a value of `task`.
+            actuator: value of the field of this name; None leaves it as it is.
+            arguments: other fields, and options; and arguments of the environment's constructor,
+                such as `render_mode`, which are returned.
 
         Raises:
-            UnknownOptionError: a name is neither a field nor an option.
             ValueError: as for the class.
         """
-        # A third-party environment may have an argument with the name of a field that only tasks
-        # have; it belongs to the options.
-        names = {*find_source(task).fields} - {"options", "max_episode_steps"}
-        fields = {name: value for name, value in arguments.items() if name in names}
-        options = {
-            name: value for name, value in arguments.items() if name not in (*names, "options")
-        }
-        return cls(
-            task,
-            actuator,
-            options={**options_mapping(arguments.get("options")), **options},
-            **fields,
-        )
+        config = env if isinstance(env, EnvConfig) else cls(env)
+        fields = {} if actuator is None else {"actuator": actuator}
+        return config.override({**fields, **(arguments or {})})
 
     def override(self, arguments: Mapping[str, Any]) -> tuple["EnvConfig", dict[str, Any]]:
         """Return a copy with fields and options replaced, and the arguments that are neither."""
@@ -169,7 +369,7 @@ class EnvConfig:
                 else source.non_default_options(self.options)
             )
             fields["options"] = {**present_options, **options}
-        return dataclasses.replace(self, **fields), remaining
+        return (dataclasses.replace(self, **fields) if fields else self), remaining
 
     @property
     def source(self) -> EnvSource:
@@ -218,37 +418,27 @@ class EnvConfig:
         """Fields that define a policy's actions and observations; they cannot change later."""
         return {name: getattr(self, name) for name in ("action", "levels", "observe_actuator")}
 
-    def as_arguments(self) -> dict[str, Any]:
-        """Return keyword arguments for `gymnasium.make`, without those that are None or off."""
-        names = [name for name in self.source.fields if name not in ("task", "options")]
-        arguments = {name: getattr(self, name) for name in names} | {
-            "randomize": self.distributions or None
-        }
-        set_arguments = {
-            name: value
-            for name, value in arguments.items()
-            if value is not None and value not in (NO_DISTURBANCES, UNMODIFIED_JOINT)
-        }
-        return set_arguments | self.source.non_default_options(self.options)
-
-    def make(self, **view: Any) -> "gymnasium.Env[Any, Any]":
+    def build(self, **arguments: Any) -> Env:
         """Build the environment.
 
         Args:
-            **view: `render_mode` and other rendering settings; for a task `width`, `height`,
-                `camera` and `pretty`, as for `codrl_mj.envs.ActuatedEnv`. Fields and options given
-                here replace those of the configuration.
+            **arguments: `render_mode` and other rendering settings; for a task `width`, `height`,
+                `camera` and `pretty`, as for `codrl_mj.envs.ActuatedEnv`; otherwise arguments of
+                `gymnasium.make` and of the environment. Fields and options given here replace those
+                of the configuration.
 
         Raises:
             ValueError: fields contradict each other, or do not fit the model.
         """
-        config, view = self.override(view)
-        env = config.source.make(config, **view)
+        config, remaining = self.override(arguments)
+        env = config.source.make(config, **remaining)
         if not isinstance(env, gymnasium.Env):
-            raise ValueError(f"{config.task}: its `make` returned {env!r}: must be a gymnasium.Env")
+            raise ValueError(
+                f"{config.source.name}: its `make` returned {env!r}: must be a gymnasium.Env"
+            )
         return env
 
-    def make_vec(self, num_envs: int = 1, **arguments: Any) -> Any:
+    def build_vec(self, num_envs: int = 1, **arguments: Any) -> VecEnv:
         """Build N environments as a Gymnasium vector environment; see `codrl_mj.make_vec`."""
         # A list holds one actuator per environment, so it is not a value of the field `actuator`
         # and bypasses `override`.
@@ -265,6 +455,11 @@ class EnvConfig:
         # Names of runs are hashes of this mapping. A field that was added later is left out at its
         # default, so that the names of existing runs stay valid.
         omitted = {"joint_dynamics"} if self.joint_dynamics is None else {*()}
+        if not isinstance(self.task, str):
+            raise ValueError(
+                f"task = {self.task!r}: must be a name to be written to a file: register the"
+                " environment, or name the function as module:NAME"
+            )
         return {
             **{
                 field.name: getattr(self, field.name)
@@ -335,3 +530,12 @@ def _to_json_values(actuator: Any) -> Any:
 def _plain(value: Any) -> Any:
     """Return numpy's numbers and arrays as Python's numbers and lists."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+
+
+def check_time_limit(env: EnvConfig) -> None:
+    """Raise ValueError if an environment has no time limit, so that episodes might never end."""
+    if env.time_limit is None:
+        raise ValueError(
+            f"max_episode_steps = None: {env.source.name} was registered without a time limit, and"
+            " its episodes might never end: give one, in environment steps"
+        )

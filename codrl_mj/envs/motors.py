@@ -1,6 +1,5 @@
 """Motors in a simulation of any model: their commands, randomization and signals."""
 
-import dataclasses
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -9,14 +8,13 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.actuators import ActuatorModel, Command, Family, Inputs, parameters_type
+from codrl_mj.actuators import ActuatorModel, Family, Inputs, parameters_type
 from codrl_mj.actuators.noise import MAX_KEY
-from codrl_mj.disturbances import NO_DISTURBANCES, Disturbances
 from codrl_mj.engine.families import USER_HEADER_SIZE, signals_offset
 from codrl_mj.engine.reading import Readout, actuators_sharing_motor, bring_to_rest, motor_slots
 from codrl_mj.engine.specs import match_pattern, matchable_names
-from codrl_mj.envs.commands import ControlCommands, command_of
-from codrl_mj.envs.distributions import parse_randomize
+from codrl_mj.envs.commands import ControlCommands, commands_by_pattern
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.randomization import (
     Randomization,
     RandomizationState,
@@ -30,46 +28,13 @@ from codrl_mj.physics.variation import without_additions, write_fields
 _POSITION = int(mujoco.mjtWarning.mjWARN_BADQPOS)
 
 
-@dataclasses.dataclass(frozen=True)
-class MotorSettings:
-    """Settings of the motors in a third-party environment; the arguments of `codrl_mj.make`."""
-
-    actuators: Mapping[str, ActuatorModel]
-    """Pattern of actuators' names -> actuator."""
-    action: str = "force"
-    """Command that an action represents."""
-    observe_actuator: bool = False
-    """True to append the values of the motors' sensors to observations."""
-    randomize: Any = None
-    """Distributions of the fields that are drawn at every reset."""
-    disturbances: Disturbances = NO_DISTURBANCES
-    """Disturbances of commands, and load pulses."""
-    allow_unstable: bool = False
-    """See `codrl_mj.add_motors`."""
-    joint_dynamics: str | None = None
-    """See `codrl_mj.add_motors`."""
-
-    @functools.cached_property
-    def commands(self) -> dict[str, Command]:
-        """Pattern -> command that an action represents for its motors."""
-        return {
-            pattern: command_of(actuator, self.action, pattern)
-            for pattern, actuator in self.actuators.items()
-        }
-
-    @property
-    def simulated(self) -> dict[str, ActuatorModel]:
-        """Pattern -> actuator to simulate; a command may bypass a part of it."""
-        return {pattern: command.actuator for pattern, command in self.commands.items()}
-
-
 class ActuatorBank:
     """The motors of one simulation, whose model was built with `codrl_mj.add_motors`."""
 
     def __init__(
         self,
         data: mujoco.MjData,
-        settings: MotorSettings,
+        config: EnvConfig,
         actions: spaces.Space,
         step_duration: float | None,
     ) -> None:
@@ -77,7 +42,7 @@ class ActuatorBank:
 
         Args:
             data: the simulation.
-            settings: settings of its motors.
+            config: settings of its motors.
             actions: action space of the environment without motors.
             step_duration: duration of an environment step [s]; None if unknown.
         """
@@ -85,10 +50,10 @@ class ActuatorBank:
         self.readout = Readout(model)
         self.motors = dict(self.readout.motors)
         """Actuator index in the model -> motor of the present episode."""
-        names, is_force_command = matchable_names(model), settings.action == "force"
+        names, is_force_command = matchable_names(model), config.action == "force"
         commands_by_index = {
             index: command
-            for pattern, command in settings.commands.items()
+            for pattern, command in commands_by_pattern(config).items()
             for index in match_pattern(pattern, names)
         }
         nominal = {
@@ -103,7 +68,7 @@ class ActuatorBank:
             for index in self.motors
         }
         self._commands = ControlCommands(
-            data, actions, motor_commands, settings.disturbances, step_duration
+            data, actions, motor_commands, config.disturbances, step_duration
         )
         self.action_space = self._commands.action_space
         self.controls = self._commands.controls
@@ -112,7 +77,7 @@ class ActuatorBank:
             commands_by_index[index].fixed if index in commands_by_index else {}
             for index in nominal
         ]
-        distributions, timestep = parse_randomize(settings.randomize), model.opt.timestep
+        distributions, timestep = config.distributions, model.opt.timestep
         bare_model = without_additions(model, nominal) if distributions else model
         randomization = Randomization(
             distributions,
@@ -120,22 +85,22 @@ class ActuatorBank:
             nominal,
             fixed,
             timestep,
-            settings.allow_unstable,
+            config.allow_unstable,
             "the model",
         )
-        if not settings.allow_unstable:
+        if not config.allow_unstable:
             check_extremes(randomization, nominal, model)
         self.randomization_state = RandomizationState(
             randomization, [list(nominal.values())], functools.partial(apply_to_simulation, self)
         )
-        draws_numbers = settings.disturbances.random or randomization.may_need_key
+        draws_numbers = config.disturbances.random or randomization.may_need_key
         self._needs_key = draws_numbers or any(actuator.random for actuator in nominal.values())
         self.names = motor_names(model, self.motors)
         """Names of the motors, in the model's order."""
         families: list[Family] = list(map(type, self.motors.values()))
         self.sensors = (
             sensor_names(dict(zip(self.names, families, strict=True)))
-            if settings.observe_actuator
+            if config.observe_actuator
             else ()
         )
         """Names of the entries of `sensor_values`; empty if they are not observed."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from codrl_mj.envs.config import EnvConfig
@@ -24,17 +24,16 @@ class ActuatedVecEnv(VecEnv):
     records them). The actuators' signals of the last step are in `signals`, as arrays.
     """
 
-    def __init__(self, env: ActuatedVectorEnv | SerialVectorEnv) -> None:
+    def __init__(self, env: "VectorEnv[Any, Any, Any]") -> None:
         """Wrap a vector environment in `SAME_STEP` mode.
 
         Raises:
-            ValueError: the agents cannot use its spaces or autoreset mode; it is closed first.
+            ValueError: it is of another class than those of `codrl_mj.make_vec`; or the agents
+                cannot use its spaces or autoreset mode. It is closed first.
         """
-        observation_space, action_space, problem = (
-            env.single_observation_space,
-            env.single_action_space,
-            "",
-        )
+        observation_space = env.single_observation_space
+        action_space = env.single_action_space
+        problem = ""
         if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
             problem = (
                 f"observations are {observation_space}: must be a vector, because the"
@@ -49,12 +48,14 @@ class ActuatedVecEnv(VecEnv):
                 f"actions are {action_space}: must be a vector (Box), or a choice (Discrete) that"
                 " counts from 0"
             )
+        elif not isinstance(env, ActuatedVectorEnv | SerialVectorEnv):
+            problem = f"env = {env!r}: must be a vector environment of codrl_mj.make_vec"
         elif env.autoreset_mode != AutoresetMode.SAME_STEP:
             problem = (
                 f"autoreset_mode = {env.autoreset_mode.value!r}: must be 'SameStep', the mode of"
                 " Stable-Baselines3"
             )
-        if problem:
+        if problem or not isinstance(env, ActuatedVectorEnv | SerialVectorEnv):
             env.close()
             raise ValueError(problem)
         self.env = env
@@ -257,13 +258,13 @@ def make_sb3_vec_env(
         ValueError: unknown id, or an argument out of bounds; too little memory; or observations or
             actions that agents cannot use.
     """
-    actuator_argument = {} if actuator is None else {"actuator": actuator}
     if callable(env_id):
-        if actuator_argument:
+        if actuator is not None:
             raise ValueError(
                 f"actuator = {actuator!r}: the function makes environments that have their motors:"
                 " leave it out, and pass functools.partial(codrl_mj.make, ENV, ACTUATOR)"
             )
         return ActuatedVecEnv(SerialVectorEnv(num_envs, env_id, **arguments))
-    config = EnvConfig(env_id) if isinstance(env_id, str) else env_id
-    return ActuatedVecEnv(config.make_vec(num_envs, **actuator_argument, **arguments))
+    actuator_argument = {} if actuator is None else {"actuator": actuator}
+    config, _ = EnvConfig.of(env_id)
+    return ActuatedVecEnv(config.build_vec(num_envs, **actuator_argument, **arguments))

@@ -1,20 +1,23 @@
 """A `VectorEnv` that steps environments one by one, for those that cannot be batched."""
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from codrl_mj.envs.setup import is_per_environment
-from codrl_mj.envs.single import ActuatedEnv
+from codrl_mj.envs.config import Env
 from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
 from codrl_mj.envs.vector import check_counts
 from codrl_mj.physics import Signals
 
 Array = np.ndarray
+VECTOR_ARGUMENTS = ("num_threads", "autoreset_mode")
+"""Keyword arguments of vector environments that a single environment does not have."""
+BYTES_PER_ENV = 20_000
+"""Memory that an environment of a task takes [bytes]."""
 _BOOKKEEPING = ("elapsed", "observations", "ended")
 """Entries of a snapshot that belong to the vector, and not to its environments."""
 
@@ -30,52 +33,39 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
     def __init__(
         self,
         num_envs: int,
-        task: str | Callable[..., Any],
-        actuator: Any = "default",
+        make: Callable[..., Env] | Sequence[Callable[..., Env]],
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
         num_threads: int = 0,
+        bytes_per_env: int = BYTES_PER_ENV,
         **arguments: Any,
     ) -> None:
         """Build the environments.
 
         Args:
             num_envs: number of environments, >= 1.
-            task: the task's name; or a function that makes an environment with its actuators;
-                the function must be picklable if the vector is sent to another process.
-            actuator: as for `ActuatedEnv`; or a sequence with one actuator for each environment.
-            max_episode_steps: time limit of each environment [steps]; None for none.
+            make: function that makes an environment with its actuators; or one for each
+                environment.
+            max_episode_steps: time limit of each environment [steps]; None for that of `make`.
             autoreset_mode: reset of an environment after its episode, as for `ActuatedVectorEnv`.
             num_threads: 0 or 1; there is only one thread.
-            **arguments: the other arguments of `ActuatedEnv`, such as `physics`; or those of the
-                function.
+            bytes_per_env: memory that an environment takes [bytes], which is checked first.
+            **arguments: arguments of the function.
 
         Raises:
             ValueError: an argument is unknown or out of bounds, or a current loop is unstable; the
                 message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
-        # The last argument is the memory of one environment [bytes].
-        check_counts(num_envs, max_episode_steps, 20_000 if isinstance(task, str) else 200_000)
+        check_counts(num_envs, max_episode_steps, bytes_per_env)
         if num_threads not in (0, 1):
             raise ValueError(
                 f"num_threads = {num_threads!r}: must be 0 or 1: these environments are stepped one"
                 " by one; only tasks on physics='mujoco' are stepped as a batch: leave it out"
             )
-        make: Any = task
-        actuator_arguments = [{} if actuator == "default" else {"actuator": actuator}] * num_envs
-        if isinstance(task, str):
-            make = functools.partial(ActuatedEnv, task)
-            if is_per_environment(actuator, task):
-                actuator_arguments = [{"actuator": env_actuator} for env_actuator in actuator]
-        if len(actuator_arguments) != num_envs:
-            raise ValueError(
-                f"actuator: got {len(actuator_arguments)} actuators for {num_envs} environments;"
-                " give one for each environment"
-            )
+        makers = [make] * num_envs if callable(make) else list(make)
         env_functions = [
-            functools.partial(_make_env, max_episode_steps, make, {**arguments, **argument})
-            for argument in actuator_arguments
+            functools.partial(_make_env, max_episode_steps, maker, arguments) for maker in makers
         ]
         super().__init__(env_functions, autoreset_mode=AutoresetMode(autoreset_mode))
         # Signals of the last step, each an array of shape (N,) or (N, motors).

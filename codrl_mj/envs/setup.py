@@ -236,45 +236,88 @@ def unwrap_single(values: Sequence[Any]) -> Any:
     return values[0] if len(values) == 1 else tuple(values)
 
 
-def is_per_environment(actuator: Any, task: str) -> bool:
+def task_config(task: str | EnvConfig, actuator: Any, arguments: Mapping[str, Any]) -> EnvConfig:
+    """Return the configuration that keyword arguments of a task's environment describe.
+
+    Raises:
+        UnknownOptionError: an argument is neither a field nor an option.
+        ValueError: as for `EnvConfig`; or the environment is no task.
+    """
+    config, remaining = EnvConfig.of(task, actuator, arguments)
+    if config.source.task is None:
+        raise ValueError(f"task = {config.task!r}: must be a task; use codrl_mj.make for others")
+    if remaining:
+        # The source's check of options names the unknown one, and those that exist.
+        config.source.options(remaining)
+    return config
+
+
+def is_per_environment(actuator: Any, task: Task) -> bool:
     """Return True if `actuator` is a list with one actuator per environment, not per motor."""
     is_listed = isinstance(actuator, Sequence) and not isinstance(actuator, str)
     return is_listed and (
-        len(find_task(task).motors) == 1
+        len(task.motors) == 1
         or all(isinstance(env_actuator, list | tuple) for env_actuator in actuator)
     )
 
 
-def set_up_many(
-    num_envs: int, task: str, actuator: Any, arguments: Mapping[str, Any]
-) -> tuple[ResolvedEnv, list[tuple[ActuatorModel, ...]]]:
-    """Return the configuration that the environments share, and the actuators of each one."""
+def configs_per_environment(config: EnvConfig, num_envs: int, actuator: Any) -> list[EnvConfig]:
+    """Return the configuration of each of many environments.
+
+    Args:
+        config: configuration of all of them.
+        num_envs: number of environments.
+        actuator: one actuator for all of them, a list with one for each, or None for the
+            configuration's.
+
+    Raises:
+        ValueError: the list has another length, or an actuator is unknown or out of bounds.
+    """
+    task = find_task(config.task)
     if not is_per_environment(actuator, task):
-        setup = ResolvedEnv.build(EnvConfig.from_arguments(task, actuator, arguments))
-        return setup, [setup.commands.simulated] * num_envs
+        return [
+            config if actuator is None else config.override({"actuator": actuator})[0]
+        ] * num_envs
     if len(actuator) != num_envs:
         raise ValueError(
             f"actuator: got {len(actuator)} actuators for {num_envs} environments; give one for"
             " each environment"
         )
-    if arguments.get("action", "force") != "force":
-        raise ValueError(
-            f"action = {arguments['action']!r}: must be 'force' with one actuator per environment"
-        )
-    setups: dict[Any, ResolvedEnv] = {}
-    actuators: list[tuple[ActuatorModel, ...]] = []
+    configs = []
     for index, env_actuator in enumerate(actuator):
         try:
-            config = EnvConfig.from_arguments(task, env_actuator, arguments)
-            actuators.append(config.actuators)
-            if actuators[-1] not in setups:
-                setups[actuators[-1]] = ResolvedEnv.build(config)
+            configs.append(dataclasses.replace(config, actuator=env_actuator))
         except ValueError as error:
             raise ValueError(f"actuator[{index}]: {error}") from None
-        if isinstance(actuators[-1][0], Ideal):
+    return configs
+
+
+def set_up_many(
+    config: EnvConfig, num_envs: int, actuator: Any
+) -> tuple[ResolvedEnv, list[tuple[ActuatorModel, ...]]]:
+    """Return the setup that many environments share, and the actuators of each of them.
+
+    The arguments are those of `configs_per_environment`.
+    """
+    configs = configs_per_environment(config, num_envs, actuator)
+    if not is_per_environment(actuator, find_task(config.task)):
+        setup = ResolvedEnv.build(configs[0])
+        return setup, [setup.commands.simulated] * num_envs
+    if config.action != "force":
+        raise ValueError(
+            f"action = {config.action!r}: must be 'force' with one actuator per environment"
+        )
+    setups: dict[tuple[ActuatorModel, ...], ResolvedEnv] = {}
+    for index, env_config in enumerate(configs):
+        try:
+            if env_config.actuators not in setups:
+                setups[env_config.actuators] = ResolvedEnv.build(env_config)
+        except ValueError as error:
+            raise ValueError(f"actuator[{index}]: {error}") from None
+        if isinstance(env_config.actuators[0], Ideal):
             raise ValueError(
-                f"actuator[{index}] = {env_actuator!r}: must not be ideal: environments with and"
+                f"actuator[{index}] = {actuator[index]!r}: must not be ideal: environments with and"
                 " without motors cannot be combined"
             )
     check_same_family([motor_actuators[0] for motor_actuators in setups])
-    return setups[actuators[0]], actuators
+    return setups[configs[0].actuators], [env_config.actuators for env_config in configs]

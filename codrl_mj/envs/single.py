@@ -12,7 +12,7 @@ from codrl_mj.envs.attributes import GymnasiumAttributes, read, validate_states,
 from codrl_mj.envs.compiled import bind_observation, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.randomization import RandomizationState, apply_to_simulation
-from codrl_mj.envs.setup import ResolvedEnv, unwrap_single
+from codrl_mj.envs.setup import ResolvedEnv, task_config, unwrap_single
 from codrl_mj.envs.snapshots import check_snapshot, encode_name, generator_from_words
 from codrl_mj.physics import MujocoPhysics, SimulationConfig, signal_names, trace_names
 from codrl_mj.physics.offscreen import DisplayWindow, OffscreenRenderer, check_view
@@ -44,9 +44,8 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     def __init__(
         self,
-        task: str,
-        actuator: Any = "default",
-        physics: str = "mujoco",
+        task: str | EnvConfig,
+        actuator: Any = None,
         render_mode: str | None = None,
         width: int = 480,
         height: int = 480,
@@ -57,19 +56,17 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         """Build the environment.
 
         Args:
-            task: the task's name, such as `cartpole`.
-            actuator: actuator that delivers the force, as for `EnvConfig.actuator`.
-            physics: `mujoco`, `analytic` (Gymnasium's equations, or a closed form), or a registered
-                name.
+            task: the task's name, such as `cartpole`; or a configuration.
+            actuator: actuator that delivers the force, as for `EnvConfig.actuator`; None for the
+                task's or the configuration's own.
             render_mode: None; `rgb_array`: `render` returns images; `human`: pygame shows every
                 step in a window. `gymnasium.make` warns of other modes, and `render` refuses them.
             width: width of rendered images [px].
             height: height of rendered images [px].
             camera: a camera of the model: `fixed` or `close`.
             pretty: True to render shadows, reflections and multisampling.
-            **arguments: the other fields of `codrl_mj.envs.config.EnvConfig`: `integrator`,
-                `inner_steps`, `timestep`, `allow_unstable`, `action`, `levels`, `observe_actuator`,
-                `disturbances`, `joint`, `randomize`; and options of the task (CartPole:
+            **arguments: the other fields of `codrl_mj.EnvConfig`, such as `physics`,
+                `observe_actuator` and `randomize`, and options of the task (CartPole:
                 `center_radius`, `sutton_barto_reward`).
 
         Raises:
@@ -77,7 +74,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
                 the message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
-        config = EnvConfig.from_arguments(task, actuator, {"physics": physics, **arguments})
+        config = task_config(task, actuator, arguments)
         self.setup = ResolvedEnv.build(config)
         self.physics = self.setup.simulate()
         apply_values = functools.partial(apply_to_simulation, self.physics)

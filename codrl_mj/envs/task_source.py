@@ -1,29 +1,34 @@
 """Tasks as env sources: their fields and options, and the construction of their environments."""
 
-import dataclasses
+import functools
 import math
-import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.envs.sources import (
+from codrl_mj.envs import register
+from codrl_mj.envs.config import (
     COMMON_FIELDS,
+    SOURCE_KINDS,
+    Env,
+    EnvConfig,
     EnvSource,
-    describe_box,
+    SourceKind,
+    VecEnv,
     options_mapping,
-    pattern_mapping,
-    source_of,
 )
-from codrl_mj.fields import check_pattern, did_you_mean, field_docs
-from codrl_mj.tasks import TASKS, Task, find_task, reference_of, register, resolve_actuators
+from codrl_mj.envs.patterns import pattern_mapping
+from codrl_mj.fields import check_pattern, did_you_mean
+from codrl_mj.tasks import TASKS, Task, find_task, reference_of, resolve_actuators
 from codrl_mj.user_code import asset_path
+
+_NOT_OPTIONS = ("render_mode", "width", "height", "camera", "pretty", "disable_env_checker")
+"""Arguments of `gymnasium.make` and of an environment's rendering, which are no options."""
 
 
 class UnknownOptionError(ValueError, TypeError):
@@ -34,44 +39,55 @@ class TaskEnvSource(EnvSource):
     """Env source of one task, built-in or custom."""
 
     fields = (*COMMON_FIELDS, "physics", "integrator", "inner_steps", "timestep", "levels", "joint")
-    evaluation_overrides = ("max_episode_steps", "options")
+    task: Task
 
     def __init__(self, task: Task) -> None:
         """Take the attributes of the task."""
-        self.task, self.name, self.preset = task, task.name, task.name
+        self.task, self.name, self.option_names = task, task.name, task.options._fields
         self.time_limit, self.paper = task.max_episode_steps, tuple(task.paper)
         self.default_actuator = task.default_actuator
-        self.goal_hold, self.timed = task.goal_hold, task.goal is not None
-        self.option_names, self.env_id = task.options._fields, task.env_id
-
-    def make(self, config: Any, **view: Any) -> Any:
-        """Make an environment with `gymnasium.make`; `view` as for `codrl_mj.envs.ActuatedEnv`."""
-        return gymnasium.make(
-            self.env_id, disable_env_checker=True, **config.as_arguments(), **view
-        )
-
-    def make_vec(self, config: Any, num_envs: int, **arguments: Any) -> Any:
-        """Make a vector environment: a batch on MuJoCo, otherwise stepped one by one."""
-        from codrl_mj.envs.serial import SerialVectorEnv
-        from codrl_mj.envs.vector import ActuatedVectorEnv
-
-        arguments = {"max_episode_steps": config.time_limit} | config.as_arguments() | arguments
-        is_human = arguments.get("render_mode") == "human"
-        if arguments["physics"] == "mujoco" and not is_human:
-            return ActuatedVectorEnv(
-                num_envs, config.task, **{"autoreset_mode": AutoresetMode.SAME_STEP, **arguments}
-            )
-        if arguments["physics"] == "mujoco":
-            gymnasium.logger.warn(
-                f"render_mode = 'human': {num_envs} environments of {self.name} are stepped one by"
-                " one, which is slow; batches render with 'rgb_array'"
-            )
-        return SerialVectorEnv(num_envs, config.task, **arguments)
 
     @property
     def reference(self) -> str:
         """Name of a built-in task, `module:NAME` of a custom one."""
         return reference_of(self.task)
+
+    def make(self, config: EnvConfig, **arguments: Any) -> Env:
+        """Make an environment with `gymnasium.make`.
+
+        The arguments are those of `gymnasium.make` and of `codrl_mj.envs.ActuatedEnv`.
+        """
+        if unknown := {name: arguments[name] for name in arguments if name not in _NOT_OPTIONS}:
+            # Gymnasium would append all arguments to the error of the class.
+            self.options(unknown)
+        limit = {"max_episode_steps": config.time_limit, "disable_env_checker": True}
+        env: Env = gymnasium.make(self.task.env_id, task=config, **(limit | arguments))
+        return env
+
+    def make_vec(self, config: EnvConfig, num_envs: int, **arguments: Any) -> VecEnv:
+        """Make a vector environment: a batch on MuJoCo, otherwise stepped one by one."""
+        from codrl_mj.envs.serial import SerialVectorEnv
+        from codrl_mj.envs.setup import configs_per_environment
+        from codrl_mj.envs.single import ActuatedEnv
+        from codrl_mj.envs.vector import ActuatedVectorEnv, check_counts
+
+        limit, is_human = config.time_limit, arguments.get("render_mode") == "human"
+        if config.physics == "mujoco" and not is_human:
+            settings = {"autoreset_mode": AutoresetMode.SAME_STEP, "max_episode_steps": limit}
+            return ActuatedVectorEnv(num_envs, config, **(settings | arguments))
+        if config.physics == "mujoco":
+            gymnasium.logger.warn(
+                f"render_mode = 'human': {num_envs} environments of {self.name} are stepped one by"
+                " one, which is slow; batches render with 'rgb_array'"
+            )
+        check_counts(num_envs, limit)
+        configs = configs_per_environment(config, num_envs, arguments.pop("actuator", None))
+        env_functions = [functools.partial(ActuatedEnv, config) for config in configs]
+        return SerialVectorEnv(num_envs, env_functions, limit, **arguments)
+
+    def action_space(self, config: EnvConfig) -> "gymnasium.spaces.Space[Any]":  # noqa: ARG002
+        """Return the task's action space, which is the same with any actuator."""
+        return self.task.action_space
 
     def code(self, options: Any) -> set[str | Path]:  # noqa: ARG002 - options contain no files
         """Return the task's module and MJCF file."""
@@ -123,25 +139,6 @@ class TaskEnvSource(EnvSource):
             if value != options._field_defaults[name]
         }
 
-    def option_flags(self, config: Any) -> list[tuple[str, Any, str, Any]]:
-        """Return the flags of all tasks' options, so that messages can name another task's flag."""
-        option_types: dict[str, Any] = {name: task.options for name, task in TASKS.items()}
-        changed_options = self.non_default_options(config.options)
-        return [
-            (
-                option,
-                hint | None,
-                f"{task}: {field_docs(option_type)[option]}",
-                changed_options.get(option),
-            )
-            for task, option_type in option_types.items()
-            for option, hint in typing.get_type_hints(option_type).items()
-        ]
-
-    def options_of(self, flags: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the options whose flags were set."""
-        return {name: value for name, value in flags.items() if value is not None}
-
     def actuators(self, actuator: Any) -> Any:
         """Return the actuator of a single motor, or a tuple with those of several, in order."""
         patterns = pattern_mapping(actuator)
@@ -171,6 +168,10 @@ class TaskEnvSource(EnvSource):
                 actuators_by_motor[motor] = actuator
         return actuators_by_motor
 
+    def override_actuators(self, config: EnvConfig, patterns: Mapping[str, Any]) -> dict[str, Any]:
+        """Return motor -> actuator: those of `patterns`, and the configuration's for the rest."""
+        return {**config.actuators_by_name, **self._by_pattern(patterns)}
+
     def actuators_by_name(self, actuators: Any) -> dict[str, ActuatorModel]:
         """Return motor -> actuator."""
         return dict(
@@ -181,118 +182,21 @@ class TaskEnvSource(EnvSource):
             )
         )
 
-    def override_actuators(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
-        """Return motor -> actuator: those in `patterns`, else the configured ones."""
-        return {**config.actuators_by_name, **self._by_pattern(patterns)}
 
-    @property
-    def scripted_task(self) -> Task:
-        """The task, if it has a scripted controller, which needs a single motor."""
-        if len(self.task.motors) > 1:
-            raise ValueError(
-                f"task {self.name!r} has {len(self.task.motors)} motors: there is no scripted"
-                " controller; train it with --actuator ideal and name the run, or give time,"
-                " torque and speed of each joint as .npz files"
-            )
-        return self.task
-
-    def with_motor_steps(self, config: Any) -> Any:
-        """Return a configuration on MuJoCo, with the integration steps that a motor would need."""
-        inner_steps = (
-            {}
-            if config.inner_steps or config.timestep
-            else {"inner_steps": self.task.motor_inner_steps}
-        )
-        return dataclasses.replace(config, physics="mujoco", **inner_steps)
-
-    def action_space(self, config: Any) -> Any:  # noqa: ARG002 - the same with any actuator
-        """Return the task's action space."""
-        return self.task.action_space
-
-    def default_agent(self, config: Any) -> str:  # noqa: ARG002
-        """Return the task's default agent; for five of the built-in tasks the paper's."""
-        return str(self.task.agent)
-
-    def view(self, config: Any, width: int, height: int, camera: str | None) -> None:  # noqa: ARG002
-        """Check size and camera; return None, because images are rendered from recorded states."""
-        import mujoco
-
-        from codrl_mj.physics.offscreen import check_view
-
-        model = mujoco.MjModel.from_xml_path(str(asset_path(self.task.asset)))
-        check_view(model, width, height, camera or "fixed")
-
-    def scene(self, config: Any) -> tuple[Any, Any, str | None]:  # noqa: ARG002 - always the same
-        """Return the task's model with bounds and hills, a function that poses it, and a camera."""
-        from codrl_mj.envs.single import ActuatedEnv
-
-        env = ActuatedEnv(self.reference, "ideal")
-
-        def show(state: np.ndarray) -> Any:
-            env.physics.show(state)
-            return env.data
-
-        return env.model, show, "fixed"
-
-    def state_names(self, config: Any) -> tuple[str, ...]:  # noqa: ARG002
-        """Return the task's state names."""
-        return self.task.state_names
-
-    def interface(self, config: Any) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        """Describe observation and action, with names and units of task, sensors and commands."""
-        from codrl_mj.envs.commands import command_of
-        from codrl_mj.envs.setup import ResolvedEnv
-
-        setup, motors = ResolvedEnv.build(config), config.actuators
-        sensor_units = [
-            motors[0].SIGNAL_UNITS.get(name.rpartition(".")[2]) for name in setup.sensors
-        ]
-        observations = describe_box(
-            setup.observation_names,
-            setup.observation_space,
-            [*self.task.observation_units, *sensor_units],
-        )
-        coordinates = [
-            self.task.state_names[self.task.qpos[self.task.qvel.index(speed_index)]]
-            for speed_index in self.task.speed_indices
-        ]
-        joint_units = ["N*m" if name.endswith("[rad]") else "N" for name in coordinates]
-        is_force_command = config.action == "force"
-        units = (
-            joint_units
-            if is_force_command
-            else [command_of(actuator, config.action).unit for actuator in motors]
-        )
-        commands = setup.commands
-        if isinstance(commands.action_space, spaces.Box):
-            return observations, describe_box(self.task.motors, commands.action_space, units)
-        table: Any = commands.action_forces if is_force_command else config.levels
-        names = [
-            {"name": name, "unit": unit} for name, unit in zip(self.task.motors, units, strict=True)
-        ]
-        columns = np.reshape(table, (len(table), -1)).T.tolist()
-        return observations, [
-            {**entry, "levels": levels} for entry, levels in zip(names, columns, strict=True)
-        ]
-
-    def at_goal(self, episode: Any) -> np.ndarray | None:
-        """Return True for states at the goal; without a goal, for all if it did not terminate."""
-        if self.task.goal is None:
-            return np.full(len(episode.state), not episode.terminated)
-        return np.asarray(self.task.goal(episode.state.T), dtype=bool)
+def _wrap(target: Any, name: str | None) -> TaskEnvSource | None:  # noqa: ARG001 - see SourceKind
+    """Return the source of a task, which is registered; None for other objects."""
+    return TaskEnvSource(register(target)) if isinstance(target, Task) else None
 
 
-def claims(name: str) -> bool:
-    """Return True if this is a task's name or Gymnasium id."""
-    return name in TASKS or any(name == task.env_id for task in TASKS.values())
-
-
-def find(name: Any) -> TaskEnvSource:
-    """Return the env source of the task with this name."""
+def _find(name: str) -> TaskEnvSource:
+    """Return the source of the task with a name or Gymnasium id."""
     tasks_by_id = {task.env_id: task for task in TASKS.values()}
     return TaskEnvSource(tasks_by_id[name] if name in tasks_by_id else find_task(name))
 
 
-@source_of.register
-def _(task: Task) -> TaskEnvSource:
-    return TaskEnvSource(register(task))
+def _claims(name: str) -> bool:
+    """Return True if this is a task's name or Gymnasium id."""
+    return name in TASKS or any(name == task.env_id for task in TASKS.values())
+
+
+SOURCE_KINDS.append(SourceKind(_claims, _find, _wrap))

@@ -11,8 +11,9 @@ from gymnasium.vector.utils import batch_space
 
 from codrl_mj.envs.attributes import GymnasiumAttributes, is_shared, read, validate_states, write
 from codrl_mj.envs.compiled import Kernels, VectorStep, compiled_kernels
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.randomization import RandomizationState, apply_to_batch
-from codrl_mj.envs.setup import set_up_many
+from codrl_mj.envs.setup import set_up_many, task_config
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.fields import free_memory
 from codrl_mj.physics import Signals
@@ -45,12 +46,11 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
     def __init__(
         self,
         num_envs: int,
-        task: str,
-        actuator: Any = "default",
+        task: str | EnvConfig,
+        actuator: Any = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         num_threads: int = 0,
-        physics: str = "mujoco",
         render_mode: str | None = None,
         width: int = 480,
         height: int = 480,
@@ -62,7 +62,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
 
         Args:
             num_envs: number of environments, >= 1.
-            task: the task's name.
+            task: the task's name, or a configuration, whose time limit does not count.
             actuator: as for `ActuatedEnv`; or a sequence of N actuators (tuples of them for several
                 motors), one for each environment: all of one family, and not ideal.
             max_episode_steps: time limit of each environment [steps]; None for none.
@@ -70,8 +70,6 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
                 (`NEXT_STEP`), in the same step (`SAME_STEP`), or by the caller (`DISABLED`), who
                 calls `reset(options={"reset_mask": ...})`.
             num_threads: threads of the engine; 0 uses every CPU. Results do not depend on it.
-            physics: `mujoco`; the analytic physics steps one Gymnasium environment at a time and
-                cannot be batched.
             render_mode: None; or `rgb_array`: `render` returns an image of every environment,
                 `image` that of one; or `rgb_array_list`, the same under the name that Gymnasium's
                 vector wrappers expect.
@@ -95,16 +93,18 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             raise ValueError(
                 f"num_threads = {num_threads!r}: must be an integer >= 0 (0: every CPU)"
             )
-        if physics != "mujoco":
-            raise ValueError(
-                f"physics = {physics!r}: a vector environment needs 'mujoco'; the analytic physics"
-                " steps one Gymnasium environment at a time: use vectorization_mode='sync' for it"
-            )
         if render_mode not in (None, *self.metadata["render_modes"]):
             modes = ", ".join(self.metadata["render_modes"])
             raise ValueError(f"render_mode = {render_mode!r}: must be one of None, {modes}")
         self.num_envs = int(num_envs)
-        self.setup, actuators = set_up_many(self.num_envs, task, actuator, arguments)
+        # A list has one actuator for each environment; it is no value of `EnvConfig.actuator`.
+        config = task_config(task, None, arguments)
+        if config.physics != "mujoco":
+            raise ValueError(
+                f"physics = {config.physics!r}: a vector environment needs 'mujoco'; the analytic"
+                " physics steps one Gymnasium environment at a time: use vectorization_mode='sync'"
+            )
+        self.setup, actuators = set_up_many(config, self.num_envs, actuator)
         self.physics = MujocoBatchPhysics(self.setup.simulation, actuators, int(num_threads))
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {

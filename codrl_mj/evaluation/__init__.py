@@ -9,7 +9,7 @@ from codrl_mj.evaluation.episodes import (
     run_episodes,
     save_episode,
 )
-from codrl_mj.evaluation.evaluate import MEASURES, Evaluation, evaluate, summarize
+from codrl_mj.evaluation.evaluate import MEASURES, Evaluation, at_goal, evaluate, summarize
 from codrl_mj.evaluation.measures import Interval, Quartiles, bootstrap_mean
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "Interval",
     "Quartiles",
     "RandomPolicy",
+    "at_goal",
     "bootstrap_mean",
     "check_episodes",
     "evaluate",

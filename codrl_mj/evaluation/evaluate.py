@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Drive, Ideal, shaft
-from codrl_mj.envs.sources import EnvSource, find_source
+from codrl_mj.envs.config import check_time_limit, find_source
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import (
     Interval,
@@ -26,6 +26,7 @@ from codrl_mj.evaluation.measures import (
     wilson_rate,
 )
 from codrl_mj.runs.policies import Policy
+from codrl_mj.tasks import Task
 
 
 def _measure(label: str, unit: str) -> Any:
@@ -164,7 +165,8 @@ def evaluate(
             observations or actions.
         SimulationDivergedError: a simulation has a value that is not finite.
     """
-    recorded_episodes = run_episodes(policy, env.make, episodes, seed, deterministic, on_step)
+    check_time_limit(env)
+    recorded_episodes = run_episodes(policy, env.build, episodes, seed, deterministic, on_step)
     conditions = {"env": env.as_mapping(), "seed": seed, "deterministic": deterministic}
     return dataclasses.replace(summarize(env.task, recorded_episodes), conditions=conditions)
 
@@ -180,11 +182,14 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
         ValueError: unknown task.
     """
     env_source = find_source(task)
+    own_task = env_source.task
     returns = np.array([episode.total for episode in episodes])
-    goals = [_time_to_goal(env_source, episode) for episode in episodes]
+    goals = [_time_to_goal(own_task, episode) for episode in episodes]
     reached = np.array([time for time in goals if time is not None])
+    # A task without a goal is to survive until the time limit.
+    reports_time = own_task is not None and own_task.goal is not None
     success = None
-    if any(env_source.at_goal(episode) is not None for episode in episodes):
+    if any(at_goal(own_task, episode) is not None for episode in episodes):
         success = wilson_rate(len(reached), len(episodes))
     traces_by_episode = [motor_traces(episode) for episode in episodes]
     each_motor = (
@@ -205,7 +210,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
             if success is None
             else Interval(1 - success.mean, 1 - success.high, 1 - success.low)
         ),
-        time_to_goal=quartiles(reached) if env_source.timed and len(reached) else None,
+        time_to_goal=quartiles(reached) if reports_time and len(reached) else None,
         episode_returns=tuple(returns.tolist()),
         episode_times_to_goal=() if success is None else tuple(goals),
         # A motor's energies are means over the episodes, without intervals.
@@ -220,14 +225,29 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     )
 
 
-def _time_to_goal(env_source: EnvSource, episode: Episode) -> float | None:
+def at_goal(task: Task | None, episode: Episode) -> np.ndarray | None:
+    """Return a bool array (T+1,), True for states at the goal; None if the goal is unknown.
+
+    A task without a goal is at its goal in all states, unless the episode terminated. A third-party
+    environment reports only at the end of an episode whether it succeeded.
+    """
+    if task is None:
+        succeeded = episode.succeeded
+        return None if succeeded is None else np.full(len(episode.state), succeeded)
+    if task.goal is None:
+        return np.full(len(episode.state), not episode.terminated)
+    return np.asarray(task.goal(episode.state.T), dtype=bool)
+
+
+def _time_to_goal(task: Task | None, episode: Episode) -> float | None:
     """Return the time from which a successful episode holds the goal [s]; None if it failed."""
-    step, at_goal = float(episode.time[0]), env_source.at_goal(episode)
-    if at_goal is None:
+    step, mask = float(episode.time[0]), at_goal(task, episode)
+    if mask is None:
         return None
-    since = holds_since(at_goal) * step
+    since = holds_since(mask) * step
+    hold_duration = 0.0 if task is None else task.goal_hold
     # Half a step is added because times are sums of floating-point steps.
-    succeeded = since + env_source.goal_hold < episode.time[-1] + 0.5 * step
+    succeeded = since + hold_duration < episode.time[-1] + 0.5 * step
     return since if succeeded else None
 
 

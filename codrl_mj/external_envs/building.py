@@ -11,6 +11,8 @@ import mujoco
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.specs import add_motors, match_pattern, matchable_names, resolve_patterns
+from codrl_mj.envs.commands import commands_by_pattern
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.tasks import TASKS
 
 
@@ -122,6 +124,14 @@ class ModelPatcher:
                 pattern,
                 [names for model_names in self._names_of_models.values() for names in model_names],
             )
+
+
+def patcher_of(config: EnvConfig) -> ModelPatcher:
+    """Return the patcher that adds a configuration's motors."""
+    actuators = {
+        pattern: command.actuator for pattern, command in commands_by_pattern(config).items()
+    }
+    return ModelPatcher(actuators, config.allow_unstable, config.joint_dynamics, config.action)
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """Environments of dm_control with motors: `make_dm_control`. Needs the extra `dm-control`."""
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,11 +13,11 @@ from dm_env import specs
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.disturbances import NO_DISTURBANCES, resolve
-from codrl_mj.engine.specs import resolve_patterns
-from codrl_mj.envs.motors import ActuatorBank, MotorSettings
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.motors import ActuatorBank
 from codrl_mj.external_envs import check_dm_control
-from codrl_mj.external_envs.building import ModelPatcher
+from codrl_mj.external_envs.building import patcher_of
+from codrl_mj.external_envs.sources import ExternalEnvSource
 from codrl_mj.fields import did_you_mean
 
 
@@ -31,14 +32,11 @@ class MotorsAddedEnvironment(dm_env.Environment):
     def __init__(
         self,
         build: Callable[[], dm_env.Environment],
-        settings: MotorSettings,
+        config: EnvConfig,
         noise_seed: int | None = None,
     ) -> None:
         """Build the environment, with motors."""
-        self._settings = settings
-        self._patcher = ModelPatcher(
-            settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action
-        )
+        self._config, self._patcher = config, patcher_of(config)
         with self._patcher.patch_model_loading():
             self._environment = build()
         if not isinstance(self._environment, dm_env.Environment):
@@ -50,7 +48,7 @@ class MotorsAddedEnvironment(dm_env.Environment):
         self._patcher.check()
         # Compared by name, because dm_control.composer may not be imported.
         classes = type(self._environment).__mro__
-        if settings.randomize is not None and any(
+        if config.randomize is not None and any(
             environment_class.__module__.startswith("dm_control.composer")
             for environment_class in classes
         ):
@@ -67,7 +65,7 @@ class MotorsAddedEnvironment(dm_env.Environment):
 
     def reset(self) -> dm_env.TimeStep:
         """Start an episode, with the motors at rest; composer environments rebuild their model."""
-        if self._settings.randomize is not None:
+        if self._config.randomize is not None:
             self._bank.randomization_state.draw_single(self._generator)
         with self._patcher.patch_model_loading():
             timestep = self._environment.reset()
@@ -106,7 +104,7 @@ class MotorsAddedEnvironment(dm_env.Environment):
                 np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum)
             )
             actions = spaces.Box(low, high, dtype=np.float64)
-            bank = ActuatorBank(data, self._settings, actions, self._environment.control_timestep())
+            bank = ActuatorBank(data, self._config, actions, self._environment.control_timestep())
             self._bound = model, bank
         return self._bound[1]
 
@@ -141,7 +139,7 @@ class MotorsAddedEnvironment(dm_env.Environment):
     def action_spec(self) -> Any:
         """Return the action specification, with the limits of the motors' commands."""
         spec = self._environment.action_spec()
-        if self._settings.action == "force":
+        if self._config.action == "force":
             return spec
         space: Any = self._bank.action_space
         return specs.BoundedArray(spec.shape, spec.dtype, space.low, space.high, spec.name)
@@ -202,17 +200,7 @@ def make_dm_control(
         RuntimeError: dm_control does not work with the installed MuJoCo.
     """
     check_dm_control()
-    resolved_actuators = resolve_patterns(actuators, "a dm_control environment")
-    resolved_disturbances = resolve(disturbances, NO_DISTURBANCES)
-    settings = MotorSettings(
-        resolved_actuators,
-        action,
-        False,
-        randomize,
-        resolved_disturbances,
-        allow_unstable,
-        joint_dynamics,
-    )
+    creator: Callable[..., Any]
     if not isinstance(environment, str) and not callable(environment):
         raise ValueError(
             f"environment = {environment!r}: must be DOMAIN/TASK, or a function that makes an"
@@ -220,12 +208,23 @@ def make_dm_control(
             " suite.load(DOMAIN, TASK)"
         )
     if not isinstance(environment, str):
-        return MotorsAddedEnvironment(lambda: environment(**options), settings, noise_seed)
-    domain, _, task = environment.partition("/")
-    if (domain, task) not in suite.ALL_TASKS:
-        known = ["/".join(pair) for pair in suite.ALL_TASKS]
-        raise ValueError(
-            f"environment = {environment!r}: {did_you_mean(environment, known)}must be DOMAIN/TASK"
-            " of dm_control.suite.ALL_TASKS, or a function"
-        )
-    return MotorsAddedEnvironment(lambda: suite.load(domain, task, **options), settings, noise_seed)
+        name, creator = getattr(environment, "__name__", "environment"), environment
+    else:
+        domain, _, task = environment.partition("/")
+        if (domain, task) not in suite.ALL_TASKS:
+            known = ["/".join(pair) for pair in suite.ALL_TASKS]
+            raise ValueError(
+                f"environment = {environment!r}: {did_you_mean(environment, known)}must be"
+                " DOMAIN/TASK of dm_control.suite.ALL_TASKS, or a function"
+            )
+        name, creator = environment, functools.partial(suite.load, domain, task)
+    settings: dict[str, Any] = {"randomize": randomize, "disturbances": disturbances}
+    config = EnvConfig(
+        ExternalEnvSource(name, creator),
+        actuators,
+        action=action,
+        allow_unstable=allow_unstable,
+        joint_dynamics=joint_dynamics,
+        **settings,
+    )
+    return MotorsAddedEnvironment(functools.partial(creator, **options), config, noise_seed)

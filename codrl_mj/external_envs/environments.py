@@ -4,7 +4,6 @@ import copy
 import dataclasses
 import functools
 import inspect
-import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,15 +11,14 @@ import gymnasium
 import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
-from gymnasium.envs.registration import EnvSpec, load_env_creator
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.disturbances import NO_DISTURBANCES, resolve
 from codrl_mj.engine.reading import bring_to_rest, motor_slots, motors
-from codrl_mj.engine.specs import resolve_patterns
-from codrl_mj.envs.motors import ActuatorBank, MotorSettings, extend_space
+from codrl_mj.envs.config import Env, EnvConfig
+from codrl_mj.envs.motors import ActuatorBank, extend_space
 from codrl_mj.envs.recording import SubstepRecorder
 from codrl_mj.envs.snapshots import (
     check_snapshot,
@@ -31,85 +29,29 @@ from codrl_mj.envs.snapshots import (
     set_state_of,
     state_of,
 )
-from codrl_mj.external_envs.building import ModelPatcher
+from codrl_mj.external_envs.building import patcher_of
 from codrl_mj.physics.streams import generator_words
 
 
-def make(
-    env_id: str | Callable[..., Any],
-    actuators: Mapping[Any, Any],
-    *,
-    action: str = "force",
-    observe_actuator: bool = False,
-    randomize: Mapping[str, Any] | None = None,
-    disturbances: Any = None,
-    allow_unstable: bool = False,
-    joint_dynamics: str | None = None,
-    **options: Any,
+def make_with_motors(
+    spec: EnvSpec, creator: Callable[..., Env], config: EnvConfig, **options: Any
 ) -> "MotorsAddedEnv":
-    """Create a Gymnasium environment, built-in or third-party, with motors.
+    """Create a Gymnasium environment with motors.
 
     With `"ideal"` actuators it is bit for bit the environment that `gymnasium.make` makes.
 
     Args:
-        env_id: the id; or a function or class that makes the environment, registered or not.
-        actuators: pattern of actuators' names -> actuator, as for `codrl_mj.add_motors`.
-        action: `force` to keep the environment's actions; the forces that they cause in the model
-            become the motors' desired forces (a position servo remains a position servo). Or
-            another command of the actuators, such as `current` or `voltage`, whose limits become
-            the action space. The environment still computes its costs from the model's controls:
-            for a current from the corresponding torque, for a voltage from the number of volts.
-        observe_actuator: True to append the motors' sensor values to the observation, motor by
-            motor.
-        randomize: path -> distribution (or its text), drawn at every reset. Paths are FIELD for all
-            motors, PATTERN:FIELD for the motors that a pattern matches, and `model.mass.BODY`,
-            `model.gravity` and `model.damping.JOINT` for the model. Alternatively, pattern -> field
-            -> distribution. The drawn values are in the reset's info, `randomization`. A separate
-            generator draws them, so the environment's initial states do not change.
-        disturbances: delay, quantum and rate of the commands, and load pulses, once per environment
-            step: see `codrl_mj.Disturbances`. They act on a plain motor's force [N or N*m] before
-            the gear, and on the control of other actuators.
-        allow_unstable: as for `codrl_mj.add_motors`.
-        joint_dynamics: as for `codrl_mj.add_motors`.
-        **options: arguments of `gymnasium.make` and the environment, such as `render_mode` and
-            `max_episode_steps`.
+        spec: specification of the environment.
+        creator: class or function that makes it without motors.
+        config: settings of its motors.
+        **options: arguments of `gymnasium.make` and the environment, such as `render_mode`.
 
     Raises:
-        gymnasium.error.UnregisteredEnv: there is no such environment.
-        ValueError: see `codrl_mj.add_motors`; a model is not built from XML; or an argument does
-            not fit the actuators or the environment.
+        ValueError: see `codrl_mj.add_motors`; a model is not built from XML; or the configuration
+            does not fit the model.
     """
-    if isinstance(env_id, str):
-        entry = gymnasium.spec(env_id)
-    elif not callable(env_id):
-        raise ValueError(
-            f"env = {env_id!r}: must be an id, or a function or class that makes an environment;"
-            " pass a function instead of an environment, such as lambda: gymnasium.make(ID)"
-        )
-    else:
-        # Gymnasium accepts few characters in an id, and not those of <lambda>.
-        name = re.sub(r"[^\w:.-]", "", str(getattr(env_id, "__name__", "")))
-        entry = EnvSpec(name or "environment", env_id)
-        env_id = entry.id
-    if str(entry.entry_point).startswith("codrl_mj.envs:"):
-        raise ValueError(
-            f"{env_id}: this task has its own actuators: gymnasium.make({env_id!r}, actuator=...)"
-        )
-    settings = MotorSettings(
-        resolve_patterns(actuators, f"the environment {env_id}"),
-        action,
-        observe_actuator,
-        randomize,
-        resolve(disturbances, NO_DISTURBANCES),
-        allow_unstable,
-        joint_dynamics,
-    )
-    spec, entry_point = copy.copy(entry), entry.entry_point
-    spec.entry_point = MotorsAddedCreator(
-        load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point,
-        settings,
-        env_id,
-    )
+    spec = copy.copy(spec)
+    spec.entry_point = MotorsAddedCreator(creator, config, spec.id)
     return MotorsAddedEnv(gymnasium.make(spec, **options))
 
 
@@ -119,7 +61,7 @@ class MotorsAddedCreator:
 
     creator: Any
     """Original class or function, which makes the environment without motors."""
-    settings: MotorSettings
+    config: EnvConfig
     """Settings of the motors."""
     env_id: str
     """Id of the environment, for messages."""
@@ -132,10 +74,7 @@ class MotorsAddedCreator:
 
     def __call__(self, **options: Any) -> gymnasium.Env:
         """Make the environment."""
-        settings = self.settings
-        patcher = ModelPatcher(
-            settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action
-        )
+        patcher = patcher_of(self.config)
         # An error of a registered id names the id already.
         is_function = self.env_id.rpartition(":")[2] not in gymnasium.registry
         if is_function:
@@ -257,7 +196,7 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
                 " codrl_mj.signals"
             )
         assert base.spec is not None
-        self._settings: MotorSettings = base.spec.entry_point.settings  # type: ignore[union-attr]
+        self._config: EnvConfig = base.spec.entry_point.config  # type: ignore[union-attr]
         self._generator = np.random.default_rng()
         self._was_reset = False
         self._bind()
@@ -267,7 +206,7 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         base: Any = self.unwrapped
         self._recorder: SubstepRecorder | None = None
         self._bank = ActuatorBank(
-            base.data, self._settings, self.env.action_space, getattr(base, "dt", None)
+            base.data, self._config, self.env.action_space, getattr(base, "dt", None)
         )
         if self._bank.action_space is not self.env.action_space:
             self.action_space = self._bank.action_space
@@ -292,7 +231,7 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         if self._recorder is None:
             dt = getattr(self.unwrapped, "dt", None)
             self._recorder = SubstepRecorder(
-                self._bank, self._settings.action, dt if isinstance(dt, float) else None
+                self._bank, self._config.action, dt if isinstance(dt, float) else None
             )
         return self._recorder
 

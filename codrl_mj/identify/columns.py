@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from codrl_mj.catalogue.units import to_si
 from codrl_mj.fields import check_names
 from codrl_mj.identify.log import SIGNALS
 
@@ -195,7 +196,6 @@ class Column:
         kind, unit = COLUMN_UNITS[self.signal], self.unit
         if unit is None or (not kind and unit in ("", "1")):
             return value
-        from codrl_mj.catalogue.units import to_si
 
         try:
             return to_si(value, unit, kind, self.signal)

@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from codrl_mj.actuators import Drive, Supply, actuator_from_mapping
 from codrl_mj.identify.estimate import Fit, best_initial_state
 from codrl_mj.identify.log import Log, Segment, gapless_stretches, initial_state
 from codrl_mj.identify.parameters import DEFAULTS, MOTOR_PARAMETERS, PARAMETERS
@@ -27,8 +28,6 @@ START_DURATION = 0.03
 
 def base_motor(base: Mapping[str, Any] | None) -> Any:
     """Return the `GearMotor` of a drive's mapping; None if it has none."""
-    from codrl_mj.actuators import Drive, actuator_from_mapping
-
     drive = None if base is None else actuator_from_mapping(base)
     return drive.motor if isinstance(drive, Drive) else None
 
@@ -322,8 +321,6 @@ class Identified:
         Raises:
             ValueError: a parameter is neither identified nor known; the message names it.
         """
-        from codrl_mj.actuators import Drive, Supply, actuator_from_mapping
-
         problem = self.problem()
         if problem is not None:
             raise ValueError(problem)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from codrl_mj.actuators import actuator_from_mapping, allow_imports, display_name
-from codrl_mj.envs.sources import pattern_mapping
+from codrl_mj.envs.patterns import pattern_mapping
 from codrl_mj.fields import flatten
 from codrl_mj.runs import (
     BEST,

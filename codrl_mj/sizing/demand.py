@@ -11,8 +11,14 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import IDEAL
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation import at_goal, run_episodes
 from codrl_mj.fields import did_you_mean
+from codrl_mj.runs.policies import load_policy
+from codrl_mj.sizing.scripted import Scripted, observe_state
 from codrl_mj.sizing.swing import Swing
+from codrl_mj.tasks import Task
+from codrl_mj.training.folder import load_config
 
 EPISODES = 10
 """Default number of episodes for a demand."""
@@ -121,28 +127,53 @@ def demands_of(
                 f"{path}: no recording of the arrays time, torque and speed: {error}"
             ) from None
         return {"": demand}
-    from codrl_mj.envs.config import EnvConfig
-    from codrl_mj.evaluation import run_episodes
 
     if path.is_dir():
-        from codrl_mj.runs.policies import load_policy
-        from codrl_mj.training.folder import load_config
-
         env = load_config(path, trust).env
         if other_families := [actuator.family for actuator in env.actuators if actuator != IDEAL]:
             raise ValueError(
                 f"{path}: was trained on {other_families[0]}: must be ideal, so that no motor"
                 " limits the torques; train it with --actuator ideal, or name the task instead"
             )
-        env = env.source.with_motor_steps(env)
-        episodes_run = run_episodes(load_policy(path, trust), env.make, episodes, seed)
+        env = with_motor_steps(env)
+        episodes_run = run_episodes(load_policy(path, trust), env.build, episodes, seed)
         return _demands_from_episodes(f"the policy {path.name} of {env.task}", env, episodes_run)
-    from codrl_mj.sizing.scripted import Scripted, observe_state
 
     env = EnvConfig(str(subject), "ideal")
-    policy, env = Scripted(env.source.scripted_task), env.source.with_motor_steps(env)
-    episodes_run = run_episodes(policy, lambda: observe_state(env.make()), episodes, seed)
+    policy, env = Scripted(scripted_task(env)), with_motor_steps(env)
+    episodes_run = run_episodes(policy, lambda: observe_state(env.build()), episodes, seed)
     return _demands_from_episodes(f"{policy.description} of {env.source.name}", env, episodes_run)
+
+
+def scripted_task(env: EnvConfig) -> Task:
+    """Return an environment's task, whose scripted controller shows what its motor must do.
+
+    Raises:
+        ValueError: there is no such controller: it needs a task with a single motor.
+    """
+    source, task = env.source, env.source.task
+    if task is None:
+        raise ValueError(
+            f"{source.name}: there is no scripted controller for it; train it with --actuator ideal"
+            " and name the run"
+        )
+    if len(task.motors) > 1:
+        raise ValueError(
+            f"task {task.name!r} has {len(task.motors)} motors: there is no scripted controller;"
+            " train it with --actuator ideal and name the run, or give time, torque and speed of"
+            " each joint as .npz files"
+        )
+    return task
+
+
+def with_motor_steps(env: EnvConfig) -> EnvConfig:
+    """Return a configuration on MuJoCo, with the integration steps that a motor would need."""
+    task = env.source.task
+    if task is None:
+        return env
+    if env.inner_steps or env.timestep:
+        return dataclasses.replace(env, physics="mujoco")
+    return dataclasses.replace(env, physics="mujoco", inner_steps=task.motor_inner_steps)
 
 
 def demand_from_arrays(time: Any, torque: Any, speed: Any, source: str = "a recording") -> Demand:
@@ -191,13 +222,13 @@ def _demands_from_episodes(source: str, env: Any, episodes: Sequence[Any]) -> di
     from codrl_mj.engine.reading import motors
     from codrl_mj.engine.specs import ON_JOINT
 
-    swing, at_goal = None, [env.source.at_goal(episode) for episode in episodes]
-    if all(mask is not None for mask in at_goal):
+    swing, goal_masks = None, [at_goal(env.source.task, episode) for episode in episodes]
+    if all(mask is not None for mask in goal_masks):
         source = (
-            f"{source}, {sum(bool(mask[-1]) for mask in at_goal if mask is not None)} of"
+            f"{source}, {sum(bool(mask[-1]) for mask in goal_masks if mask is not None)} of"
             f" {len(episodes)} episodes at the goal"
         )
-    with contextlib.closing(env.make()) as opened_env:
+    with contextlib.closing(env.build()) as opened_env:
         core: Any = opened_env.unwrapped
         if env.task == "pendulum":
             # A thin uniform rod about its end: inertia m*l^2/3, center of mass at l/2.

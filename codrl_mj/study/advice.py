@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import IDEAL as IDEAL_ACTUATOR
-from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate
 from codrl_mj.study.axes import AXES, FLOORS, REAL, SECONDS, generic_arm, ideal_arm, study_env
 from codrl_mj.study.bench import (
@@ -30,6 +29,7 @@ from codrl_mj.study.evidence import Evidence, Loss, Outcome, sum_outcomes
 from codrl_mj.study.questions import MARGIN, Scores
 from codrl_mj.study.trials import Arm, Grid, StudyResults, Trial
 from codrl_mj.training import TrainConfig, load_config
+from codrl_mj.training.config import default_agent
 
 IDEAL, COMMAND, LOOP = "train on ideal", "command more", "design the loop"
 RANDOMIZE, THROUGH = "randomise", "train through it"
@@ -411,8 +411,7 @@ def _baseline_arm(subject: str, trust: bool = False) -> Arm:
     if (Path(subject) / "config.json").is_file():
         config = load_config(Path(subject), trust)
     else:
-        env = EnvConfig(subject)
-        config = TrainConfig.preset(subject, env.source.default_agent(env))
+        config = TrainConfig.preset(subject, default_agent(subject))
     # Evaluations and checkpoints during training would only cost time.
     never = max(config.total_steps or 10**9, 10**9)
     env = dataclasses.replace(

@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation import evaluate
 from codrl_mj.fields import did_you_mean
 from codrl_mj.runs.files import read_json, write_json
+from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.parallel import Workers, call_in_parallel
 from codrl_mj.training import (
     RunInUseError,
@@ -189,9 +191,6 @@ def _train(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> Non
 
 def _run_test(test: PolicyTest) -> None:
     """Evaluate one policy."""
-    from codrl_mj.evaluation import evaluate
-    from codrl_mj.runs.policies import load_policy
-
     # The folder is trusted: its name is the digest of a configuration that this process made.
     config = load_config(test.run, trust=True)
     env = dataclasses.replace(test.env, **config.env.policy_fields)

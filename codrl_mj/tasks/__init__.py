@@ -14,14 +14,14 @@ from codrl_mj.tasks import (
 )
 from codrl_mj.tasks.base import Task
 from codrl_mj.tasks.reference_env import ReferenceEnv
-from codrl_mj.tasks.registration import TASKS, find_task, reference_of, register
+from codrl_mj.tasks.registration import TASKS, add_task, find_task, reference_of
 
 PAPER_TASKS = tuple(
-    register(module.TASK)
+    add_task(module.TASK)
     for module in (pendulum, cartpole, acrobot, mountain_car, mountain_car_continuous)
 )
 """Tasks that rebuild those of Gymnasium and have the paper's actuators."""
-register(furuta.TASK)
+add_task(furuta.TASK)
 
 
 def resolve_actuators(actuator: Any, task: Task) -> tuple[Any, ...]:
@@ -77,10 +77,10 @@ __all__ = [
     "PAPER_TASKS",
     "TASKS",
     "Task",
+    "add_task",
     "ReferenceEnv",
     "find_task",
     "named_actuator",
     "reference_of",
-    "register",
     "resolve_actuators",
 ]

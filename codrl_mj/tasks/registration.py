@@ -1,11 +1,8 @@
-"""Registry of tasks, built-in and custom, and their registration with Gymnasium."""
+"""Registry of tasks, built-in and custom."""
 
 import itertools
 import sys
 from typing import Any
-
-from gymnasium.envs.registration import register as register_with_gymnasium
-from gymnasium.envs.registration import registry
 
 from codrl_mj.tasks.base import Task
 from codrl_mj.user_code import look_up
@@ -14,40 +11,18 @@ TASKS: dict[str, Task] = {}
 """Registered tasks by their names on the command line."""
 
 
-def register(task: Task) -> Task:
-    """Register a task, so that `gymnasium.make` accepts its id, and commands accept its name.
-
-    A repeated call with the same task does nothing.
-
-    Args:
-        task: the task, from any module.
-
-    Returns:
-        The task.
+def add_task(task: Task) -> Task:
+    """Add a task to `TASKS` and return it; a repeated call with the same task does nothing.
 
     Raises:
-        ValueError: another task has the name, or another environment the id.
+        ValueError: it is no task, or another task has its name.
     """
-    if not hasattr(task, "env_id"):
+    if not isinstance(task, Task):
         raise ValueError(f"{task!r}: must be a codrl_mj.Task")
     if TASKS.get(task.name, task) is not task:
         raise ValueError(
             f"task {task.name!r} is registered already, as {reference_of(TASKS[task.name])}:"
             " rename one"
-        )
-    if task.name not in TASKS and task.env_id in registry:
-        raise ValueError(
-            f"environment id {task.env_id!r} is registered already: choose another for task"
-            f" {task.name!r}"
-        )
-    if task.env_id not in registry:
-        register_with_gymnasium(
-            id=task.env_id,
-            entry_point="codrl_mj.envs:ActuatedEnv",
-            vector_entry_point="codrl_mj.envs:ActuatedVectorEnv",
-            kwargs={"task": reference_of(task)},
-            max_episode_steps=task.max_episode_steps,
-            reward_threshold=task.reward_threshold,
         )
     TASKS[task.name] = task
     return task
@@ -84,4 +59,4 @@ def find_task(name: str) -> Task:
         ValueError: unknown name; the nearest known one is suggested.
     """
     task: Task = look_up(name, TASKS, "task")
-    return task if name in TASKS else register(task)
+    return task if name in TASKS else add_task(task)

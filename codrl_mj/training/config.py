@@ -5,11 +5,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from gymnasium import spaces
+
 from codrl_mj.actuators import allow_imports
 from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import OTHER_ENV, find_preset
-from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.config import EnvConfig, check_time_limit
 from codrl_mj.fields import Checked, check_names, integer
 from codrl_mj.user_code import read_yaml
 
@@ -63,11 +65,7 @@ class TrainConfig(Checked):
                 "TrainConfig.total_steps = None: must be an integer >= 1 unless total_episodes is"
                 " set"
             )
-        if self.total_steps is None and self.env.time_limit is None:
-            raise ValueError(
-                f"TrainConfig.total_steps = None: {self.task} has no time limit: set"
-                " max_episode_steps"
-            )
+        check_time_limit(self.env)
 
     @property
     def task(self) -> str:
@@ -110,7 +108,7 @@ class TrainConfig(Checked):
         """
         env_config = EnvConfig(task, options=(env or {}).get("options"))
         check_fits(agent, env_config)
-        preset = find_preset(agent, env_config.source.preset or OTHER_ENV, settings)
+        preset = find_preset(agent, _preset_name(env_config), settings)
         names = {field.name for field in dataclasses.fields(cls)} - {"env"}
         values = {name: value for name, value in vars(preset).items() if name in names}
         fields = {"actuator": actuator, **preset.env, **(env or {}), "task": task}
@@ -119,7 +117,7 @@ class TrainConfig(Checked):
     @property
     def evaluation_env(self) -> EnvConfig:
         """Environment of evaluations: without the training's changes of time limit and reward."""
-        changed: dict[str, Any] = dict.fromkeys(self.env.source.evaluation_overrides)
+        changed: dict[str, Any] = dict.fromkeys(_evaluation_overrides(self.env))
         return dataclasses.replace(self.env, **changed)
 
     def as_mapping(self) -> dict[str, Any]:
@@ -184,8 +182,22 @@ def default_agent(task: str, options: Any = None) -> str:
     In third-party environments it is SAC for continuous actions and PPO for other actions. The
     actions may depend on the environment's `options`.
     """
-    env_config = EnvConfig(task, options=options)
-    return env_config.source.default_agent(env_config)
+    env = EnvConfig(task, options=options)
+    if env.source.task is not None:
+        return str(env.source.task.agent)
+    return "sac" if isinstance(env.action_space, spaces.Box) else "ppo"
+
+
+def _preset_name(env: EnvConfig) -> str:
+    """Return the name under which an environment has presets."""
+    return OTHER_ENV if env.source.task is None else env.source.task.name
+
+
+def _evaluation_overrides(env: EnvConfig) -> tuple[str, ...]:
+    """Return the fields that evaluations reset to their defaults, such as a changed time limit."""
+    if env.source.task is not None:
+        return ("max_episode_steps", "options")
+    return () if env.source.time_limit is None else ("max_episode_steps",)
 
 
 def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConfig:

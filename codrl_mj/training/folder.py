@@ -33,7 +33,7 @@ from codrl_mj.runs import (
 )
 from codrl_mj.runs.files import check_writable, read_json, temporary_files
 from codrl_mj.training.config import TrainConfig
-from codrl_mj.user_code import UntrustedCodeError
+from codrl_mj.user_code import UntrustedCodeError, asset_folder
 
 _FILES = {CONFIG, RESULT, EVALUATION, PROGRESS, EPISODES, CURVE, *POLICY_FILES}
 _PACKAGES = ("codrl-mj", "gymnasium", "mujoco", "numba", "numpy", "stable-baselines3", "torch")
@@ -232,8 +232,6 @@ def provenance(config: TrainConfig) -> dict[str, Any]:
 @functools.cache
 def _code_digest(*extra: str | Path) -> str:
     """Return the SHA-256 digest of the package's Python files and models, and of other files."""
-    from codrl_mj.user_code import asset_folder
-
     package = Path(__file__).parents[1]
     digest = hashlib.sha256()
     for root, pattern in ((package, "*.py"), (asset_folder(), "*.xml")):

@@ -81,7 +81,7 @@ def train(
         folder.locked_for_training(out, record is None),
         collecting_signals(signal.SIGINT, signal.SIGTERM) as stop_signals,
     ):
-        envs = ActuatedVecEnv(config.env.source.make_vec(config.env, config.num_envs))
+        envs = ActuatedVecEnv(config.env.build_vec(config.num_envs))
         with contextlib.closing(envs), _wandb_context(wandb, out, config):
             model = config.agent.make_model(envs, config.seed)
             watcher = Watcher(config, out, stop_signals, on_progress, tensorboard)

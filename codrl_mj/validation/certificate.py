@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import importlib
 import importlib.metadata
 import math
 import platform
@@ -218,6 +217,27 @@ def _convert_errors(outcomes: Outcomes) -> Outcomes:
         yield Check(DIVERGED, "itself", 0.0, "", 1, math.inf, reason)
 
 
+def _checks_of(group: str, has_task: bool) -> Callable[[Any, bool], Outcomes]:
+    """Return the function (task, quick) that runs a group's checks."""
+    # The imports are local because some groups need optional libraries. A missing library then
+    # skips its own group only (`_convert_errors`).
+    if group == "dynamics":
+        from codrl_mj.validation.dynamics import checks
+    elif group == "trajectories":
+        from codrl_mj.validation.trajectories import checks
+    elif group == "convergence":
+        from codrl_mj.validation.convergence import checks
+    elif group == "energy":
+        from codrl_mj.validation.energy import checks
+    elif group == "execution":
+        return execution.checks
+    elif has_task:
+        return own_model.checks
+    else:
+        from codrl_mj.validation.motor import checks
+    return checks
+
+
 def validate(
     tasks: str | Sequence[str] | None = None,
     *,
@@ -255,10 +275,7 @@ def validate(
             )
 
     def run_group(group: str, task: str | None) -> Outcomes:
-        module = "own_model" if group in TASK_INDEPENDENT and task is not None else group
-        # The import is local because some groups need optional libraries. A missing library then
-        # skips its own group only (`_convert_errors`).
-        yield from importlib.import_module(f"codrl_mj.validation.{module}").checks(task, quick)
+        yield from _checks_of(group, task is not None)(task, quick)
 
     parts = [
         (group, task or "", run_group(group, task))

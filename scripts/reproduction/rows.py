@@ -172,7 +172,7 @@ def run_row(arm: PaperArm, seed: int, run: Trained) -> Row:
 
 def run_tests(arm: PaperArm, folder: Path, episodes: int) -> list[Episode]:
     """Run the first test episodes of a run's policy."""
-    return run_episodes(load_policy(folder), arm.trials[TEST].env.make, episodes, EVALUATION_SEED)
+    return run_episodes(load_policy(folder), arm.trials[TEST].env.build, episodes, EVALUATION_SEED)
 
 
 def upright_since(episode: Episode) -> float | None:

@@ -204,7 +204,7 @@ def optimum(model: Model, discount: float, episodes: int = 20) -> Optimum:
     action_values = iterate(model.rewards, model.transitions, discount)
     test_episodes = run_episodes(
         Greedy(model.grid, action_values),
-        EnvConfig(TASK, None, physics="analytic").make,
+        EnvConfig(TASK, None, physics="analytic").build,
         episodes=episodes,
     )
     lengths = np.array([len(episode.reward) for episode in test_episodes if episode.terminated])

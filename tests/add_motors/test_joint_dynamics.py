@@ -166,7 +166,7 @@ def test_environments_and_configurations_have_joint_dynamics():
     with pytest.warns(MotorWarning, match=r"joint slider has .*damping 1 \(") as caught:
         unchanged = codrl_mj.make("InvertedPendulum-v5", arguments, allow_unstable=True)
     assert caught[0].filename == __file__
-    replaced, plain = again.make(), unchanged.unwrapped.model
+    replaced, plain = again.build(), unchanged.unwrapped.model
     slider = plain.joint("slider").dofadr[0]
     assert plain.dof_damping[slider] == 1.0
     assert replaced.unwrapped.model.dof_damping[slider] == 0.0

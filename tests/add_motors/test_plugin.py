@@ -18,7 +18,7 @@ from tests.add_motors.models import Signals, Worn, arm
 def test_the_plugin_is_registered_once_and_keeps_its_slot():
     slot, structure = plugin.registered_plugins()[plugin.NAME]
     count = plugin.library().mjp_pluginCount()
-    plugin.register()
+    plugin.register(lambda: None)
     importlib.reload(codrl_mj)
     assert plugin.library().mjp_pluginCount() == count
     assert plugin.registered_plugins()[plugin.NAME][0] == slot

@@ -14,8 +14,7 @@ import pytest
 from codrl_mj.actuators import NAMED, CurrentLoop, Motor, Supply
 from codrl_mj.agents.presets import OTHER_ENV, PRESETS
 from codrl_mj.cli import VERBS, find_verb, main
-from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.sources import find_source
+from codrl_mj.envs.config import EnvConfig, find_source
 from codrl_mj.evaluation import evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.tasks import TASKS, named_actuator
@@ -160,7 +159,7 @@ def test_evaluation_equals_the_packages_and_piped_output_has_no_colors(
     monkeypatch.setenv("TERM", "xterm-256color")
     run_ok(f"evaluate {trained} --episodes 7 --seed 5 --out a/result.json")
     result = read_json("a/result.json")
-    make = EnvConfig("cartpole", "weaker").make
+    make = EnvConfig("cartpole", "weaker").build
     totals = [episode.total for episode in run_episodes(load_policy(trained), make, 7, seed=5)]
     assert result["returns"]["mean"] == pytest.approx(np.mean(totals), rel=1e-12)
     assert result["returns"] == result["length"]  # 1 a step
@@ -221,8 +220,10 @@ def test_a_run_is_evaluated_and_filmed_in_the_environment_of_its_training():
     assert expected.peak_voltage == 3.0
     run_ok("evaluate volts --episodes 2 --env.disturbances.command-delay 0 --out at_once.json")
     assert read_json("at_once.json")["returns"] != json.loads(first)["returns"]
+    # The first command arrives after five steps.
+    longer_film = SMALL_FILM.replace("steps 2", "steps 8")
     for subject in ("volts", f"cartpole {levels}"):
-        run_ok(f"render {subject} --out film.gif {SMALL_FILM}")
+        run_ok(f"render {subject} --out film.gif {longer_film}")
 
 
 def test_a_run_can_be_filmed_and_a_task_with_random_actions(capsys, trained):

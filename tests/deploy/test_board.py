@@ -161,7 +161,7 @@ def test_motor_with_its_loop_on_the_board_moves_as_in_the_simulation(name, tmp_p
     env = EnvConfig(
         "furuta", actuator=LOOPS[name], action="position" if name == "servo" else "force"
     )
-    policy, simulation = trained("furuta", "ppo")[0], env.make()
+    policy, simulation = trained("furuta", "ppo")[0], env.build()
     policy.action_space = simulation.action_space
     export(policy, env, "ppo", tmp_path / "out", 1, double=True)
     random = np.random.default_rng(0)
@@ -206,7 +206,7 @@ VOLTS = {
 @pytest.mark.parametrize("task", VOLTS)
 def test_bridge_rounds_the_voltages_of_a_policy_that_commands_them(tmp_path, task):
     env, agent = VOLTS[task]
-    with env.make() as simulation:
+    with env.build() as simulation:
         policy = agent.make_policy(simulation.observation_space, simulation.action_space)
     export(policy, env, agent.name, tmp_path / "out", 1)
     step = 2.0 * 12.0 / 2**5

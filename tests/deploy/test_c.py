@@ -181,7 +181,7 @@ def test_papers_loop_in_c_equals_the_actuators_sample_by_sample(tmp_path, name, 
         header.partition("CONTROLLER_CURRENT_RATE ")[2].partition(" ")[0].rstrip("f")
     )
     assert period == pytest.approx(
-        EnvConfig("cartpole").make().unwrapped.model.opt.timestep / controller.substeps
+        EnvConfig("cartpole").build().unwrapped.model.opt.timestep / controller.substeps
     )
     state, random, saturated = (kind * 2)(), np.random.default_rng(0), 0
     library.current_reset(state)

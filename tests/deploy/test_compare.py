@@ -31,7 +31,7 @@ def logged(tmp_path_factory):
     def run(task):
         folder, env = tmp_path_factory.mktemp(task), EnvConfig(task)
         export(trained(task, TASKS[task])[0], env, TASKS[task], folder / "out", 1)
-        (episode,) = run_episodes(OnnxPolicy(folder / "out"), env.make, 1, seed=3)
+        (episode,) = run_episodes(OnnxPolicy(folder / "out"), env.build, 1, seed=3)
         contract = Contract.read(folder / "out")
         write_log(folder / "rig.csv", contract, episode)
         return folder / "rig.csv", contract, env, episode
@@ -152,7 +152,7 @@ def test_identify_reads_the_log_of_a_board(tmp_path):
             return self.held, None
 
     Slow.held = np.zeros((1, 1), np.float32)
-    (episode,) = run_episodes(Slow(), env.make, 1, 3)
+    (episode,) = run_episodes(Slow(), env.build, 1, 3)
     write_log(tmp_path / "log.csv", Interface.from_env(env), episode)
     columns = (
         'time="time:s":s,torque="motor:N*m":N*m,'

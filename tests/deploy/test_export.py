@@ -14,6 +14,7 @@ from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.agents import AGENTS
 from codrl_mj.cli import main
 from codrl_mj.deploy import Contract, board_test, export, extract_network, onnx_model
+from codrl_mj.deploy.spaces import describe_spaces
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy
 from codrl_mj.runs.policies import load_policy, save_policy
@@ -35,7 +36,7 @@ def trained(task, agent, env=None, **settings):
     """
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    instance = EnvConfig(task, **(env or {})).make()
+    instance = EnvConfig(task, **(env or {})).build()
     config = AGENTS[agent](**settings)
     policy = config.make_policy(instance.observation_space, instance.action_space)
     instance.close()
@@ -186,7 +187,7 @@ CURRENTS = {"action": "current", "observe_actuator": True}
 )
 def test_units_are_those_of_state_signals_and_commands(task, changes, units, expected):
     config = EnvConfig(task, **changes)
-    observations, (action,) = config.source.interface(config)
+    observations, (action,) = describe_spaces(config)
     assert [entry["unit"] for entry in observations] == units
     assert (action["name"], action["unit"], action.get("levels"), action.get("most")) == expected
 
@@ -239,7 +240,7 @@ def test_tolerance_scales_with_the_largest_command(agent, tmp_path):
         "pendulum", {"name": "paper", "controller": {"max_voltage": 200.0}}, action="voltage"
     )
     policy, _ = trained("pendulum", agent)
-    policy.action_space = policy.actor.action_space = env.make().action_space
+    policy.action_space = policy.actor.action_space = env.build().action_space
     export(policy, env, agent, tmp_path / "out", 1)
     golden = Contract.read(tmp_path / "out").golden
     largest = np.abs(golden["actions"]).max()

@@ -141,7 +141,7 @@ def test_recorder_knows_the_step_duration_before_the_first_step():
 
 def test_rate_in_the_contract_and_the_c(tmp_path):
     env = EnvConfig("InvertedPendulum-v5", max_episode_steps=100)
-    with env.make() as instance:
+    with env.build() as instance:
         policy = SACConfig(hidden=(8,)).make_policy(
             instance.observation_space, instance.action_space
         )

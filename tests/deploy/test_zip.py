@@ -332,11 +332,11 @@ def test_a_contract_needs_the_bounds_of_the_training(volts):
 def test_an_evaluation_makes_only_the_environments_of_its_episodes(volts, capsys, monkeypatch):
     configs = []
 
-    def make(config, original=EnvConfig.make, **options):
+    def make(config, original=EnvConfig.build, **options):
         configs.append(config)
         return original(config, **options)
 
-    monkeypatch.setattr(EnvConfig, "make", make)
+    monkeypatch.setattr(EnvConfig, "build", make)
     line = ["evaluate", str(volts / "policy.zip"), *ZIP, "--episodes", "2"]
     assert (
         main([*line, "--env.action", "voltage", "--actuator", str(volts / "apart/motor.yaml")]) == 0

@@ -170,7 +170,9 @@ def test_randomization_raises_if_its_range_includes_unstable_motors(draws):
 
 @pytest.mark.filterwarnings("ignore:motor.rotor_inertia")
 def test_randomization_of_motors_in_custom_models_is_checked():
-    with pytest.raises(ValueError, match=r"^randomize: loop\.velocity_gain = 0\.5: "):
+    with pytest.raises(
+        ValueError, match=r"^InvertedPendulum-v5: randomize: loop\.velocity_gain = 0\.5: "
+    ):
         codrl_mj.make(
             "InvertedPendulum-v5",
             {".*": dataclasses.replace(servo(servo_rate=50.0, velocity_gain=0.01))},

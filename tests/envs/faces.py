@@ -10,12 +10,12 @@ from safetensors.numpy import load_file, save_file
 from stable_baselines3.common.vec_env import VecEnv
 
 from codrl_mj import Choice, LogUniform, Uniform, make_sb3_vec_env, suite
-from codrl_mj.envs import ActuatedEnv, SerialVectorEnv
+from codrl_mj.envs import ActuatedEnv
 from codrl_mj.physics.variation import bare_model, variable_names
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.disturbances.everything import MOST, RUBBED, imperfect
 from tests.engine.models import FULL, changed
-from tests.envs.vectors import batched
+from tests.envs.vectors import batched, serial
 
 PHYSICS = ("mujoco", "analytic")
 MOTOR = changed(FULL, inductance=0.2, substeps=3)
@@ -96,7 +96,7 @@ FACES = {
     "many, SameStep": lambda task, **options: (
         batched(task, 3, "SameStep", **LIMITED, **options).unwrapped
     ),
-    "serial, analytic": lambda task, **options: SerialVectorEnv(
+    "serial, analytic": lambda task, **options: serial(
         3, task, physics="analytic", **LIMITED, **options
     ),
     "Stable-Baselines3": lambda task, **options: make_sb3_vec_env(

@@ -6,7 +6,6 @@ import numpy as np
 from gymnasium import spaces
 
 import codrl_mj
-from codrl_mj.envs.sources import EnvSource
 
 XML = """
 <mujoco model="rig">
@@ -64,17 +63,4 @@ class RigEnv(gymnasium.Env):
         return np.concatenate([self.data.qpos, self.data.qvel])
 
 
-class Rig(EnvSource):
-    """Env source of the rig."""
-
-    name, time_limit = "rig", 30
-
-    def make(self, config, **view):
-        arguments = config.as_arguments() | {
-            "max_episode_steps": config.time_limit,
-            "disable_env_checker": True,
-        }
-        return codrl_mj.make(RigEnv, arguments.pop("actuator"), **arguments, **view)
-
-
-RIG = Rig()
+RIG = codrl_mj.ExternalEnvSource("rig", RigEnv, time_limit=30)

@@ -40,7 +40,7 @@ VECTORS = {
     "configuration": lambda num_envs, **options: make_vec(
         EnvConfig("cartpole"), num_envs, **options
     ),
-    "its method": lambda num_envs, **options: EnvConfig("cartpole").make_vec(num_envs, **options),
+    "its method": lambda num_envs, **options: EnvConfig("cartpole").build_vec(num_envs, **options),
     "class": lambda num_envs, **options: ActuatedVectorEnv(
         num_envs, "cartpole", **{"autoreset_mode": "SameStep", **options}
     ),
@@ -57,7 +57,7 @@ VECTORS = {
 SINGLE = {
     "name": functools.partial(make, "cartpole"),
     "configuration": lambda **options: make(EnvConfig("cartpole"), **options),
-    "its method": lambda **options: EnvConfig("cartpole").make(**options),
+    "its method": lambda **options: EnvConfig("cartpole").build(**options),
     "dm_control": lambda **options: suite.load("cartpole", **options).env,
 }
 

@@ -8,9 +8,9 @@ import gymnasium
 import numpy as np
 import pytest
 
-from codrl_mj import Choice, LogUniform, Uniform
+from codrl_mj import Choice, LogUniform, Uniform, make_vec
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Drive, GearMotor, Motor
-from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv, SerialVectorEnv
+from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv
 from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.envs.faces import commanded
@@ -85,7 +85,10 @@ VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
             {"action": "current", "actuator": "ideal"},
             "the ideal actuator has no current to command",
         ),
-        ({"action": "voltage", "actuator": None}, "the ideal actuator has no voltage to command"),
+        (
+            {"action": "voltage", "actuator": "ideal"},
+            "the ideal actuator has no voltage to command",
+        ),
         (
             {"observe_actuator": True, "actuator": "ideal"},
             "observe_actuator=True: the ideal actuator has no current",
@@ -142,7 +145,11 @@ def test_raises_for_a_bad_argument_of_a_single_environment(arguments, message):
         ActuatedEnv(**{"task": "cartpole", **arguments})
 
 
-@pytest.mark.parametrize("make", [ActuatedVectorEnv, SerialVectorEnv])
+def make_serial(task, num_envs, **arguments):
+    return make_vec(task, num_envs, physics="analytic", **arguments)
+
+
+@pytest.mark.parametrize("make", [ActuatedVectorEnv, make_serial])
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -169,7 +176,7 @@ def test_raises_for_a_bad_argument_of_a_vector_environment(make, arguments, mess
     [
         (
             {"physics": "analytic"},
-            "one Gymnasium environment at a time: use vectorization_mode='sync' for it",
+            "one Gymnasium environment at a time: use vectorization_mode='sync'",
         ),
         ({"num_threads": -1}, "num_threads = -1: must be an integer >= 0"),
         ({"num_threads": "2"}, "num_threads = '2': must be an integer >= 0"),

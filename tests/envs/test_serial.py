@@ -5,10 +5,17 @@ import numpy as np
 import pytest
 
 from codrl_mj import Uniform
-from codrl_mj.envs import ActuatedEnv, SerialVectorEnv
+from codrl_mj.envs import ActuatedEnv
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.envs.faces import PHYSICS, arguments
-from tests.envs.vectors import assert_equal_episodes, assert_same, batched, looped, random_actions
+from tests.envs.vectors import (
+    assert_equal_episodes,
+    assert_same,
+    batched,
+    looped,
+    random_actions,
+    serial,
+)
 from tests.tasks.faces import every_rebuilt
 
 
@@ -16,7 +23,7 @@ from tests.tasks.faces import every_rebuilt
 @pytest.mark.parametrize("physics", PHYSICS)
 def test_it_is_gymnasiums_loop_and_on_mujoco_the_batched_environment(task, physics):
     options = arguments(task, "everything", physics) | {"max_episode_steps": 11}
-    ours = SerialVectorEnv(4, task, physics=physics, **options)
+    ours = serial(4, task, physics=physics, **options)
     references = [looped(task, 4, "SameStep", physics=physics, **options)]
     references += [batched(task, 4, "SameStep", **options)] if physics == "mujoco" else []
     for reference in references:
@@ -31,7 +38,7 @@ def test_it_is_gymnasiums_loop_and_on_mujoco_the_batched_environment(task, physi
 def test_signals_and_draws_are_those_of_the_batched_environment(task):
     options = arguments(task, "everything") | {"max_episode_steps": 7}
     ours, theirs = (
-        SerialVectorEnv(3, task, **options),
+        serial(3, task, **options),
         batched(task, 3, "SameStep", **options).unwrapped,
     )
     assert ours.signals is None
@@ -52,7 +59,7 @@ def test_signals_and_draws_are_those_of_the_batched_environment(task):
 
 
 def test_without_a_time_limit_episodes_do_not_end():
-    env = SerialVectorEnv(2, "pendulum", physics="analytic")
+    env = serial(2, "pendulum", physics="analytic")
     env.reset(seed=0)
     assert not any(env.step(np.zeros((2, 1), np.float32))[3].any() for _ in range(250))
     assert env.task is TASKS["pendulum"]
@@ -61,13 +68,13 @@ def test_without_a_time_limit_episodes_do_not_end():
 def test_each_can_have_an_actuator_of_its_own():
     actuators = [named_actuator(name, "cartpole") for name in ("paper", "weak", "weaker")]
     drawn = {"randomize": {"motor.resistance": Uniform(1, 2)}}
-    env = SerialVectorEnv(3, "cartpole", actuators, physics="analytic", **drawn)
+    env = serial(3, "cartpole", actuators, physics="analytic", **drawn)
     env.reset(seed=3)
     env.step(np.array([1, 1, 1]))
     resistances = env.randomization["motor.resistance"]
     assert len(set(resistances)) == 3
     for row, actuator in enumerate(actuators):
-        single = ActuatedEnv("cartpole", actuator, "analytic", **drawn)
+        single = ActuatedEnv("cartpole", actuator, physics="analytic", **drawn)
         assert (
             single.reset(seed=3 + row)[1]["randomization"]["motor.resistance"] == resistances[row]
         )

@@ -9,7 +9,8 @@ import pytest
 import codrl_mj
 from codrl_mj import EnvConfig
 from codrl_mj.__main__ import main
-from codrl_mj.envs.sources import EnvSource, find_source, source_of
+from codrl_mj.envs.config import find_source
+from codrl_mj.external_envs.sources import ExternalEnvSource
 from codrl_mj.training import TrainConfig
 from codrl_mj.viz.view.session import Session
 from tests.envs.rig import RIG, RigEnv
@@ -37,7 +38,7 @@ def test_a_configuration_survives_json_and_makes_environments():
     )
     assert find_source(NAME) is config.source is RIG
     assert EnvConfig.from_mapping(json.loads(json.dumps(config.as_mapping()))) == config
-    with config.make() as env:
+    with config.build() as env:
         _, info = env.reset(seed=1)
         assert 0.1 <= info["randomization"]["motor.resistance"] <= 0.2
         # The command of the first step is delayed by one step.
@@ -47,7 +48,7 @@ def test_a_configuration_survives_json_and_makes_environments():
     assert TrainConfig.preset(NAME, "sac", actuator="lag").env.actuator_label == "lag"
 
 
-class Nameless(EnvSource):
+class Broken(ExternalEnvSource):
     def make(self, *_, **__):
         return 3
 
@@ -62,16 +63,27 @@ class Nameless(EnvSource):
         (lambda: EnvConfig("tests.envs.rig:rk4_of_nobody"), "rk4_of_nobody"),
         (
             lambda: EnvConfig("tests.envs.rig:XML"),
-            "must be a codrl_mj.Task or a codrl_mj.EnvSource",
+            "codrl_mj.Task, a codrl_mj.EnvSource, or a function or class that makes an environment",
         ),
-        (lambda: EnvConfig("tests.envs.rig:Rig"), r"^Rig: must be an instance of it: Rig\(...\)"),
         (
-            lambda: source_of(Nameless()),
-            "Nameless: must have a `name`, the text that messages use",
+            lambda: EnvConfig("codrl_mj.external_envs.sources:ExternalEnvSource"),
+            r"^ExternalEnvSource: must be an instance of it: ExternalEnvSource\(...\)",
+        ),
+        (
+            lambda: EnvConfig(Broken(None, RigEnv)),
+            "Broken: must have a `name`, the text that messages use",
         ),
         (
             lambda: codrl_mj.make(RigEnv(), {".*": "lag"}),
-            "must be an id, or a function or class that makes an env",
+            "pass a function instead of an environment, such as lambda: gymnasium.make",
+        ),
+        (
+            lambda: EnvConfig(RigEnv).as_mapping(),
+            "must be a name to be written to a file: .* name the function as module:NAME",
+        ),
+        (
+            lambda: EnvConfig(Broken("rig", RigEnv)).build(),
+            "rig: its `make` returned 3: must be a gymnasium.Env",
         ),
     ],
 )
@@ -80,15 +92,29 @@ def test_raises_for_objects_that_are_no_source_and_for_unsupported_fields(call, 
         call()
 
 
-def test_raises_if_make_returns_no_environment(monkeypatch):
-    named = Nameless()
-    named.name = "named"
-    assert source_of(named) is named
-    monkeypatch.setattr(type(RIG), "make", lambda *_, **__: 3)
-    with pytest.raises(
-        ValueError, match=r"tests.envs.rig:RIG: its `make` returned 3: must be a gymnasium.Env"
-    ):
-        EnvConfig(NAME).make()
+@pytest.mark.parametrize("env", [RigEnv, "tests.envs.rig:RigEnv", NAME, RIG])
+def test_a_class_its_name_and_a_source_make_the_same_environment(env):
+    config = EnvConfig(env, {"drive": "lag"}, max_episode_steps=3)
+    with config.build() as built, codrl_mj.make(RigEnv, {"drive": "lag"}) as expected:
+        np.testing.assert_array_equal(built.reset(seed=1)[0], expected.reset(seed=1)[0])
+        outcomes = [(built.step(np.ones(1)), expected.step(np.ones(1))) for _ in range(3)]
+        for ours, theirs in outcomes:
+            np.testing.assert_array_equal(ours[0], theirs[0])
+        assert [ours[3] for ours, _ in outcomes] == [False, False, True]
+
+
+def test_a_task_stands_for_its_name():
+    task = find_source("pendulum").task
+    assert EnvConfig(task, "weak") == EnvConfig("pendulum", "weak")
+    assert codrl_mj.make(task, "weak").spec.id == task.env_id
+
+
+def test_a_function_that_is_named_can_be_stored_and_trained_on():
+    config = EnvConfig("tests.envs.rig:RigEnv", "lag", max_episode_steps=9)
+    stored = json.loads(json.dumps(config.as_mapping()))
+    assert stored["task"] == "tests.envs.rig:RigEnv"
+    assert EnvConfig.from_mapping(stored) == config
+    assert TrainConfig.preset("tests.envs.rig:RigEnv", "sac", env={"max_episode_steps": 9})
 
 
 def test_evaluation_keeps_the_time_limit_if_the_source_has_none(monkeypatch):
@@ -96,7 +122,7 @@ def test_evaluation_keeps_the_time_limit_if_the_source_has_none(monkeypatch):
         NAME, "sac", env={"max_episode_steps": 9, "options": {"target": 0.5}}
     )
     assert config.evaluation_env.time_limit == RIG.time_limit
-    monkeypatch.setattr(type(RIG), "time_limit", None)
+    monkeypatch.setattr(RIG, "time_limit", None)
     assert config.evaluation_env.time_limit == 9
 
 
@@ -106,7 +132,7 @@ def test_an_error_inside_an_environment_is_not_blamed_on_options_that_were_not_s
         with pytest.raises(
             ValueError, match=r"^Broken-v0: object of type 'int' has no len"
         ) as error_info:
-            EnvConfig("Broken-v0").make()
+            EnvConfig("Broken-v0").build()
         assert isinstance(error_info.value.__cause__, TypeError)
     finally:
         gym.registry.pop("Broken-v0")
@@ -117,7 +143,7 @@ def test_a_long_text_in_the_options_is_not_taken_for_a_file():
 
 
 def test_ideal_motors_change_nothing():
-    original, with_motors = RigEnv(), EnvConfig(NAME).make()
+    original, with_motors = RigEnv(), EnvConfig(NAME).build()
     np.testing.assert_array_equal(original.reset(seed=3)[0], with_motors.reset(seed=3)[0])
     for action in np.random.default_rng(0).uniform(-1, 1, (20, 1)):
         np.testing.assert_array_equal(original.step(action)[0], with_motors.step(action)[0])

@@ -1,12 +1,15 @@
 """Comparison of the vector environment with Gymnasium's loop over single environments."""
 
+import functools
+
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 # The import registers the environments.
 import codrl_mj  # noqa: F401
-from codrl_mj.envs import ActuatedVectorEnv, SerialVectorEnv
+from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv, SerialVectorEnv
+from codrl_mj.envs.setup import configs_per_environment, task_config
 from codrl_mj.tasks import TASKS
 
 MODES = tuple(mode.value for mode in AutoresetMode)
@@ -33,6 +36,14 @@ def looped(task, num_envs, mode="NextStep", **arguments):
         for actuator in actuators
     ]
     return SyncVectorEnv(env_functions, autoreset_mode=mode)
+
+
+def serial(num_envs, task, actuator=None, max_episode_steps=None, **arguments):
+    """Make a `SerialVectorEnv`; a list of actuators has one for each environment."""
+    config = task_config(task, None, arguments)
+    configs = configs_per_environment(config, num_envs, actuator)
+    env_functions = [functools.partial(ActuatedEnv, config) for config in configs]
+    return SerialVectorEnv(num_envs, env_functions, max_episode_steps)
 
 
 def assert_same(ours, theirs, path=""):

@@ -133,7 +133,7 @@ def test_a_file_assigns_actuators_to_patterns(tmp_path):
         "b.*": Drive.from_motor_parameters(motor_entry("maxon-ec45-flat-50w").parameters),
         "f.*": Lag(),
     }
-    assert train_config.env.make().unwrapped.frame_skip == 2
+    assert train_config.env.build().unwrapped.frame_skip == 2
     # Fields that the file does not name have their defaults.
     assert (train_config.agent.gamma, train_config.agent.hidden, train_config.num_envs) == (
         0.98,
@@ -267,9 +267,9 @@ def test_the_options_of_an_environment_decide_which_agents_fit():
 def test_an_episode_records_every_integration_step_and_survives_a_file():
     """Compare the trace with a loop over `mj_step`."""
     config = EnvConfig("HalfCheetah-v5", MAXON, max_episode_steps=10)
-    policy = RandomPolicy(config.make().action_space, 1)
-    (episode,) = run_episodes(policy, config.make, 1, seed=4)
-    env = config.make()
+    policy = RandomPolicy(config.build().action_space, 1)
+    (episode,) = run_episodes(policy, config.build, 1, seed=4)
+    env = config.build()
     env.reset(seed=4)
     model, data = env.unwrapped.model, env.unwrapped.data
     work = np.zeros(6)
@@ -301,7 +301,7 @@ def test_an_episode_records_every_integration_step_and_survives_a_file():
 
 def test_motors_of_several_families_have_measures_of_their_own_signals():
     config = EnvConfig("Reacher-v5", {"joint0": "lag", "joint1": "maxon-re65"})
-    evaluation = evaluate(RandomPolicy(config.make().action_space, 0), config, 2)
+    evaluation = evaluate(RandomPolicy(config.build().action_space, 0), config, 2)
     lag, maxon = evaluation.motors.values()
     assert lag["rms_current"] is None
     assert maxon["rms_current"] == pytest.approx(evaluation.rms_current)
@@ -351,11 +351,17 @@ def test_randomization_survives_files_and_flags():
 
 def test_raises_for_an_environment_without_a_time_limit():
     endless = EnvConfig("ForeignEndless-v0", {".*": "lag"})
-    with pytest.raises(ValueError, match="registered without a time limit"):
-        endless.make()
+    refused = {
+        "evaluation": lambda: evaluate(RandomPolicy(endless.action_space), endless, 1),
+        "training": lambda: TrainConfig(endless, SACConfig()),
+    }
+    for call in refused.values():
+        with pytest.raises(ValueError, match="registered without a time limit"):
+            call()
+    assert endless.build().spec.max_episode_steps is None
     limited = dataclasses.replace(endless, max_episode_steps=5)
     assert TrainConfig(limited, SACConfig()).evaluation_env.time_limit == 5
-    assert evaluate(RandomPolicy(limited.make().action_space), limited, 1).length.mean == 5
+    assert evaluate(RandomPolicy(limited.build().action_space), limited, 1).length.mean == 5
 
 
 def test_a_policy_of_stable_baselines_is_evaluated_by_the_id(capsys):

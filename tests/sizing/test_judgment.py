@@ -354,9 +354,9 @@ def test_a_run_reports_which_motors_have_a_servo(tmp_path, monkeypatch):
     )
     try:
         settings = TrainConfig(EnvConfig("JudgedArm-v0", {".*": "ideal"}), SACConfig())
-        monkeypatch.setattr("codrl_mj.training.folder.load_config", lambda *_: settings)
+        monkeypatch.setattr("codrl_mj.sizing.demand.load_config", lambda *_: settings)
         monkeypatch.setattr(
-            "codrl_mj.runs.policies.load_policy", lambda *_: RandomPolicy(settings.env.action_space)
+            "codrl_mj.sizing.demand.load_policy", lambda *_: RandomPolicy(settings.env.action_space)
         )
         demands = demands_of(tmp_path, episodes=1)
     finally:

@@ -70,7 +70,7 @@ def pendulum():
 def from_hanging(actuator, steps=400):
     """Return the states (steps + 1, 2) of the scripted swing-up from almost hanging."""
     env, policy = (
-        EnvConfig("pendulum", actuator, max_episode_steps=steps).make(),
+        EnvConfig("pendulum", actuator, max_episode_steps=steps).build(),
         Scripted(TASKS["pendulum"]),
     )
     env.reset(seed=0)
@@ -343,7 +343,7 @@ def arrivals(task, actuator, episodes=5):
     """Return the number of scripted episodes of a task that end at the goal."""
     env = EnvConfig(task, actuator, inner_steps=TASKS[task].motor_inner_steps)
     policy = Scripted(TASKS[task])
-    ran = run_episodes(policy, lambda: observe_state(env.make()), episodes, 0)
+    ran = run_episodes(policy, lambda: observe_state(env.build()), episodes, 0)
     return sum(
         not episode.terminated if task == "cartpole" else bool(TASKS[task].goal(episode.state[-1]))
         for episode in ran

@@ -87,7 +87,7 @@ def study(tmp_path_factory):
 @pytest.mark.parametrize("axis", AXES)
 def test_the_environment_of_every_severity_can_be_stepped(task, axis):
     for severity in AXES[axis].severities:
-        env = AXES[axis].make_env(task, severity).make()
+        env = AXES[axis].make_env(task, severity).build()
         env.reset(seed=0)
         for _ in range(3):
             observation, *_ = env.step(env.action_space.sample())
@@ -122,7 +122,7 @@ def test_half_of_the_voltage_gives_a_stall_torque_equal_to_the_largest_torque():
 
 @pytest.mark.matrix
 def test_a_lag_of_severity_zero_equals_the_ideal_actuator():
-    env, lag_env = study_env("pendulum").make(), AXES["lag"].make_env("pendulum", 0.0).make()
+    env, lag_env = study_env("pendulum").build(), AXES["lag"].make_env("pendulum", 0.0).build()
     for env_to_reset in (env, lag_env):
         env_to_reset.reset(seed=3)
     for _ in range(20):

@@ -39,7 +39,7 @@ RESULTS = Path(__file__).parents[2] / "docs/results"
 
 def play(config, actions):
     """Return observations without the actuator's entries, and all of them, for given actions."""
-    env = config.make()
+    env = config.build()
     observations = [env.reset(seed=3)[0]]
     observations += [env.step(action)[0] for action in actions]
     env.close()
@@ -51,7 +51,7 @@ def play(config, actions):
 @pytest.mark.parametrize("lag", [0.0, 0.7])
 def test_late_equals_lag_if_the_delay_fits_into_lag(task, steps, lag):
     step, gain = find_task(task).step_duration, 0.8
-    actions = [study_env(task).make().action_space.sample() for _ in range(40)]
+    actions = [study_env(task).build().action_space.sample() for _ in range(40)]
     ours = study_env(task, late(task, time_constant=lag * step, delay=steps * step, gain=gain))
     theirs = study_env(task, Lag(lag * step, steps * step, gain))
     np.testing.assert_allclose(play(ours, actions), play(theirs, actions), rtol=0, atol=1e-12)
@@ -61,7 +61,7 @@ def test_late_equals_lag_if_the_delay_fits_into_lag(task, steps, lag):
 @pytest.mark.parametrize("steps", [0.5, 1.0, 1.25, 2.0, 3.3, 4.0])
 def test_a_longer_delay_equals_the_environment_s_command_delay(task, steps):
     step = find_task(task).step_duration
-    actions = [study_env(task).make().action_space.sample() for _ in range(40)]
+    actions = [study_env(task).build().action_space.sample() for _ in range(40)]
     ours = study_env(task, late(task, delay=steps * step))
     theirs = study_env(task, disturbances=Disturbances(command_delay=steps * step))
     np.testing.assert_allclose(play(ours, actions), play(theirs, actions), rtol=0, atol=1e-12)
@@ -72,7 +72,7 @@ def test_the_observation_has_the_last_four_commands(task):
     config = study_env(
         task, late(task, delay=1.3 * find_task(task).step_duration), observe_actuator=True
     )
-    space = study_env(task).make().action_space
+    space = study_env(task).build().action_space
     actions = [space.sample() for _ in range(12)]
     shown = play(config, actions)[:, -4:]
     commands = [0.0, 0.0, 0.0, 0.0, *(float(np.ravel(action)[0]) for action in actions)]
@@ -88,7 +88,7 @@ def test_the_observation_has_the_last_four_commands(task):
 def test_raises_if_the_delay_exceeds_the_memory():
     step = find_task("pendulum").step_duration
     with pytest.raises(ValueError, match=r"Late\.delay"):
-        study_env("pendulum", late("pendulum", delay=4.1 * step)).make()
+        study_env("pendulum", late("pendulum", delay=4.1 * step)).build()
     assert timestep("pendulum") == pytest.approx(step / 10)
 
 

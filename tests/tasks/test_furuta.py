@@ -247,7 +247,7 @@ def test_episodes_start_hanging_within_the_reset_options():
 @every_actuator
 def test_the_scripted_controller_swings_up_and_balances(actuator):
     episodes = run_episodes(
-        Scripted(TASK), lambda: observe_state(EnvConfig("furuta", actuator).make()), 10, seed=0
+        Scripted(TASK), lambda: observe_state(EnvConfig("furuta", actuator).build()), 10, seed=0
     )
     assert summarize("furuta", episodes).success.mean == 1.0
 

@@ -30,6 +30,7 @@ from codrl_mj.viz.films.strip import (
     draw_strip,
     draw_text,
 )
+from codrl_mj.viz.scene import render_arguments
 
 _FORMATS = (".mp4", ".gif", "")
 _FILE_ENCODING = ("-preset", "veryfast", "-crf", "18")
@@ -119,13 +120,13 @@ def record(
     Third-party environments store their images while they run, and the camera `fixed` selects their
     default camera. Tasks are rendered later from their states.
     """
-    render_options = env.source.view(env, width, height, None if camera == "fixed" else camera)
+    render_options = render_arguments(env, width, height, None if camera == "fixed" else camera)
     recorders = []
     if render_options is None:
-        return Panel(env.task, run_episodes(policy, env.make, 1, seed)[0])
+        return Panel(env.task, run_episodes(policy, env.build, 1, seed)[0])
 
     def make_recorder() -> Any:
-        recorders.append(FrameRecorder(env.make(**render_options), pretty))
+        recorders.append(FrameRecorder(env.build(**render_options), pretty))
         return recorders[-1]
 
     (episode,) = run_episodes(policy, make_recorder, 1, seed)

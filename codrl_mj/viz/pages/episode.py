@@ -16,6 +16,7 @@ from codrl_mj.viz.films.film import Clip, clip, record
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.diagrams import episode_diagram
 from codrl_mj.viz.pages.plots import MAX_POINTS, Curve, Plot, Shade, flagged_intervals
+from codrl_mj.viz.scene import state_names
 
 _SIZE = 480, 360
 _MAX_EPISODE_POINTS = 400_000
@@ -64,7 +65,7 @@ def run_and_film(name: str, env: Any, policy: Any, seed: int, with_film: bool = 
         ) as error:
             problem = f"{type(error).__name__}: {error}"
     return RunEpisode(
-        name, env, episode or run_episodes(policy, env.make, 1, seed)[0], film, problem, seed
+        name, env, episode or run_episodes(policy, env.build, 1, seed)[0], film, problem, seed
     )
 
 
@@ -387,7 +388,7 @@ def _run_plots(runs: Sequence[RunEpisode]) -> list[Plot]:
         owner: Any = {"shared": run_index if has_several else None, "tags": (f"run:{run_index}",)}
         time = np.concatenate([[0.0], run.episode.time])
         counts: dict[str, int] = {}
-        for index, name in enumerate(run.env.source.state_names(run.env)):
+        for index, name in enumerate(state_names(run.env)):
             unit = (re.search(r"\[(.*)\]", name) or [name, "1"])[1]
             count = counts[unit] = counts.get(unit, -1) + 1
             if count < _MAX_STATES:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from codrl_mj.runs.summaries import (
     read_run,
 )
 from codrl_mj.sizing import CurrentLoopActuator, is_closed
+from codrl_mj.tasks import TASKS
 from codrl_mj.training.folder import load_config
 from codrl_mj.training.history import learning_curves, read_episodes
 from codrl_mj.viz.pages import certificate as certificates
@@ -222,13 +224,9 @@ def _sentence(run: RunSummary) -> str:
 
 def _task_summary(task: str) -> str:
     """Return the first line of a task's documentation."""
-    import importlib
-
-    try:
-        text = importlib.import_module(f"codrl_mj.tasks.{task}").__doc__ or ""
-    # Only our tasks are modules of the package; other environments have just a name.
-    except ImportError:
+    if task not in TASKS:
         return f"The environment {task}."
+    text = sys.modules[TASKS[task].reward.__module__].__doc__ or ""
     return text.strip().partition("\n")[0]
 
 

@@ -22,6 +22,7 @@ from codrl_mj.viz.replay.scene import (
     simplify_mesh,
     visible_shapes,
 )
+from codrl_mj.viz.scene import scene_of
 
 _HERE = Path(__file__).parent
 _POLICY = (
@@ -135,7 +136,7 @@ def motion_of_episode(episode: Episode, env: Any) -> Motion:
         episode: the episode.
         env: the `EnvConfig` that it was recorded in.
     """
-    model, show, camera = env.source.scene(env)
+    model, show, camera = scene_of(env)
     return motion(model, episode.state, np.concatenate([[0.0], episode.time]), camera, show)
 
 

@@ -323,7 +323,7 @@ class Session:
     # -- internal ---------------------------------------------------------------------------------
 
     def _make_env(self) -> Any:
-        env: Any = self.config.make()
+        env: Any = self.config.build()
         if getattr(env.unwrapped, "model", None) is None:
             raise ValueError(
                 f"{self.config.task} has no MuJoCo model to show: physics must be mujoco, the"

@@ -25,6 +25,7 @@ from codrl_mj.viz.pages import report as reports
 from codrl_mj.viz.pages.diagrams import torque_step_plot
 from codrl_mj.viz.pages.episode import RunEpisode, episode_section, run_and_film
 from codrl_mj.viz.pages.report import report
+from codrl_mj.viz.scene import state_names
 from tests.viz.pages.parsed import ParsedPage, check_self_contained
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
@@ -60,7 +61,7 @@ def test_a_report_is_one_small_file_with_every_section(text):
 def test_plots_show_the_filmed_episode(text):
     """Compare with the same episode, run again."""
     (episode,) = run_episodes(
-        load_policy(PENDULUM), load_config(PENDULUM).evaluation_env.make, 1, MEDIAN
+        load_policy(PENDULUM), load_config(PENDULUM).evaluation_env.build, 1, MEDIAN
     )
     drawn = curves(text, "Torque at the shaft")
     arm = episode.actuator.arm_radius
@@ -148,7 +149,7 @@ def test_the_episode_is_the_median_one_or_has_its_rank(run):
     write_evaluation(run, [-900.0, -200.0, -1500.0, -300.0, -1000.0])
     assert "seed 1000000, return" in report_page(run).text  # that of the median, -900
     text = report_page(run, seed=7).text
-    (episode,) = run_episodes(load_policy(run), load_config(run).evaluation_env.make, 1, 7)
+    (episode,) = run_episodes(load_policy(run), load_config(run).evaluation_env.build, 1, 7)
     worse = sum(value < episode.total for value in (-900.0, -200.0, -1500.0, -300.0, -1000.0))
     assert "seed 7, return" in text
     assert (
@@ -230,7 +231,7 @@ def motors_of(section):
 
 def test_motors_can_be_selected():
     env = load_config(PENDULUM).evaluation_env
-    (single_motor,) = run_episodes(load_policy(PENDULUM), env.make, 1, 0)
+    (single_motor,) = run_episodes(load_policy(PENDULUM), env.build, 1, 0)
     arrays = {
         field: {
             name: np.stack([values, 2.0 * values], axis=1)
@@ -302,8 +303,8 @@ def test_states_of_every_kind_of_joint_have_units(monkeypatch):
     bodies += "<body><freejoint/><geom size='.1'/></body>"
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     env = SimpleNamespace(unwrapped=SimpleNamespace(model=model), close=lambda: None)
-    monkeypatch.setattr(EnvConfig, "make", lambda _: env)
-    names = EnvConfig("Ant-v5").source.state_names(EnvConfig("Ant-v5"))
+    monkeypatch.setattr(EnvConfig, "build", lambda _: env)
+    names = state_names(EnvConfig("Ant-v5"))
     units = [re.search(r"\[(.*)\]", name)[1] for name in names]
     assert units[: model.nq] == ["1"] * 4 + ["m", "rad"] + ["m"] * 3 + ["1"] * 4
     assert units[model.nq :] == ["rad/s"] * 3 + ["m/s", "rad/s"] + ["m/s"] * 3 + ["rad/s"] * 3
@@ -326,7 +327,7 @@ def test_a_third_party_robot_with_motors_is_filmed():
     env = EnvConfig(
         "Reacher-v5", {"joint0": "maxon-ec45-flat-50w", "joint1": "quanser-qube-servo-2"}
     )
-    shown = run_and_film("reacher", env, RandomPolicy(env.make().action_space), 0)
+    shown = run_and_film("reacher", env, RandomPolicy(env.build().action_space), 0)
     assert shown.problem is None
     assert 1.0 / shown.episode.time[0] == pytest.approx(50.0)
     # Every second frame is left out, because clips have at most 30 frames per second.
