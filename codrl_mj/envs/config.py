@@ -23,7 +23,7 @@ from codrl_mj.actuators import ActuatorModel, DCMotorActuator, combined_name, ma
 from codrl_mj.disturbances import NO_DISTURBANCES, UNMODIFIED_JOINT, Disturbances, Joint, resolve
 from codrl_mj.envs.distributions import Distribution, parse_randomize
 from codrl_mj.fields import check_joint_dynamics, check_names
-from codrl_mj.tasks import Task, find_task, reference_of
+from codrl_mj.tasks import TASKS, Task, find_task, reference_of
 from codrl_mj.user_code import load_object
 
 Env = gymnasium.Env[Any, Any]
@@ -207,12 +207,11 @@ def is_source_name(name: str) -> bool:
     """Return True if a text has the form of a source's name, such as any `module:NAME`.
 
     The path of an existing folder does not count, even if it looks like a Gymnasium id
-    (`runs/swing-v2`).
+    (`runs/swing-v2`); the name of a task does.
     """
-    if re.fullmatch(r"[\w.]+:[\w.]+", name) is not None:
+    if name in TASKS or re.fullmatch(r"[\w.]+:[\w.]+", name) is not None:
         return True
-    is_folder = "/" in name and Path(name).is_dir()
-    return not is_folder and any(kind.claims(name) for kind in SOURCE_KINDS)
+    return not Path(name).is_dir() and any(kind.claims(name) for kind in SOURCE_KINDS)
 
 
 def options_mapping(options: Any) -> dict[str, Any]:

@@ -243,6 +243,11 @@ def task_config(task: str | EnvConfig, actuator: Any, arguments: Mapping[str, An
         UnknownOptionError: an argument is neither a field nor an option.
         ValueError: as for `EnvConfig`; or the environment is no task.
     """
+    if "max_episode_steps" in arguments:
+        raise ValueError(
+            f"max_episode_steps = {arguments['max_episode_steps']!r}: the environment itself has no"
+            " time limit: use codrl_mj.make or gymnasium.make, which add one"
+        )
     config, remaining = EnvConfig.of(task, actuator, arguments)
     if config.source.task is None:
         raise ValueError(f"task = {config.task!r}: must be a task; use codrl_mj.make for others")

@@ -86,6 +86,11 @@ VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
             "the ideal actuator has no current to command",
         ),
         (
+            {"max_episode_steps": 9},
+            "max_episode_steps = 9: the environment itself has no time limit",
+        ),
+        ({"task": "Hopper-v5"}, "task = 'Hopper-v5': must be a task; use codrl_mj.make for others"),
+        (
             {"action": "voltage", "actuator": "ideal"},
             "the ideal actuator has no voltage to command",
         ),

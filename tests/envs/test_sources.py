@@ -9,7 +9,7 @@ import pytest
 import codrl_mj
 from codrl_mj import EnvConfig
 from codrl_mj.__main__ import main
-from codrl_mj.envs.config import find_source
+from codrl_mj.envs.config import find_source, is_source_name
 from codrl_mj.external_envs.sources import ExternalEnvSource
 from codrl_mj.training import TrainConfig
 from codrl_mj.viz.view.session import Session
@@ -101,6 +101,16 @@ def test_a_class_its_name_and_a_source_make_the_same_environment(env):
         for ours, theirs in outcomes:
             np.testing.assert_array_equal(ours[0], theirs[0])
         assert [ours[3] for ours, _ in outcomes] == [False, False, True]
+
+
+def test_an_existing_folder_is_no_source_unless_it_has_the_name_of_a_task(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = ["pendulum", "swing-v2", "runs/swing-v2", "tests.envs.rig:RIG"]
+    assert [is_source_name(name) for name in names] == [True] * 4
+    for name in names[:3]:
+        (tmp_path / name).mkdir(parents=True)
+    assert [is_source_name(name) for name in names] == [True, False, False, True]
+    assert not is_source_name("swing")
 
 
 def test_a_task_stands_for_its_name():
