@@ -91,7 +91,7 @@ def test_failed_and_missing_trainings_are_reported(reproduction):
     assert f"- {BLOCKED.name}: seeds 0 to 1\n" in page
     assert f"- {BLOCKED.name}, seed 0 failed: " in page
     assert "- mountain_car_continuous, repaired, ideal, mujoco: seeds 0\n" in page
-    assert "\n5 trainings, " in page
+    assert "\nThe 5 trainings took " in page
     assert "A trial: every training was cut off after 2 episodes" in page
 
 
