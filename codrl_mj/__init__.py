@@ -12,7 +12,6 @@ import importlib
 import os
 import signal
 import sys
-from typing import Any
 
 __version__ = "0.1.0"
 
@@ -67,7 +66,7 @@ def _choose_headless_backend() -> None:
         os.environ.setdefault("MUJOCO_GL", "egl")
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import a public name on first use."""
     if name in _PUBLIC:
         return getattr(importlib.import_module(_PUBLIC[name]), name)

@@ -24,9 +24,9 @@ import secrets
 import sys
 import tempfile
 import types as python_types
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, Protocol, TypeVar, cast, overload
 
 import llvmlite
 import mujoco
@@ -34,13 +34,41 @@ import numba
 import numpy as np
 from llvmlite import binding
 from numba.core import serialize, sigutils, types
+from numba.core.base import BaseContext
 from numba.core.bytecode import FunctionIdentity
 from numba.core.caching import _Cache
 from numba.core.ccallback import CFunc
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.types import containers
+from numba.core.typing import Signature
 from numba.extending import _Intrinsic
+
+P = ParamSpec("P")
+R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
+F = TypeVar("F", bound=Callable[..., object])
+"""A function; the decorators here return it with its own type, because it is called the same."""
+
+
+class CompiledCallback(Protocol[P, R_co]):
+    """A function with a C address, as `cfunc` returns it."""
+
+    @property
+    def address(self) -> int:
+        """Address of the machine code; it is valid as long as this object exists."""
+
+    @property
+    def ctypes(self) -> Callable[P, R_co]:
+        """The function for Python, called through ctypes."""
+
+
+class Digest(Protocol):
+    """An object that computes a hash, such as that of `hashlib.sha256`."""
+
+    def update(self, data: bytes, /) -> None:
+        """Append bytes to the hashed text."""
+
 
 MAX_BYTES = 500_000_000
 """Maximum size of the folder [bytes]; beyond it, the least recently used files are deleted."""
@@ -75,7 +103,7 @@ def cache_folder() -> Path | None:
         return Path(setting)
     import platformdirs
 
-    return platformdirs.user_cache_path("codrl_mj") / "compiled"
+    return Path(platformdirs.user_cache_path("codrl_mj")) / "compiled"
 
 
 def _randomize_function_ids() -> None:
@@ -85,7 +113,7 @@ def _randomize_function_ids() -> None:
     gave the same symbol to different functions, the linker would confuse these functions in a
     process that loads both from the cache.
     """
-    FunctionIdentity._unique_ids = itertools.count(secrets.randbits(60))  # type: ignore[attr-defined]
+    FunctionIdentity._unique_ids = itertools.count(secrets.randbits(60))
 
 
 _randomize_function_ids()
@@ -104,32 +132,49 @@ def register_symbol(name: str, address: int) -> str:
     return name
 
 
-def external_function(name: str, function: Any, signature: Any) -> Any:
+# The signature has the types of arguments and result, but as objects of numba, not of Python.
+ExternalFunction = Callable[..., Any]
+"""A C function for compiled code; assign it to a name with a more precise type to have it checked.
+"""
+
+
+def external_function(
+    name: str, function: Callable[..., object] | ctypes.c_void_p, signature: Signature
+) -> ExternalFunction:
     """Declare a C function of ctypes for compiled code."""
-    return types.ExternalFunction(
-        register_symbol(name, ctypes.cast(function, ctypes.c_void_p).value or 0), signature
-    )
+    # ctypes has no public name for the class of its functions.
+    address = ctypes.cast(function, ctypes.c_void_p).value or 0  # type: ignore[arg-type]
+    declared: ExternalFunction = types.ExternalFunction(register_symbol(name, address), signature)
+    return declared
 
 
-def njit(function: Any = None, **options: Any) -> Any:
+@overload
+def njit(function: F, **options: object) -> F: ...
+@overload
+def njit(function: None = None, **options: object) -> Callable[[F], F]: ...
+
+
+def njit(function: F | None = None, **options: object) -> F | Callable[[F], F]:
     """Compile a function that Python calls, as `numba.njit` does, with the cache on disk."""
     if function is None:
         return functools.partial(njit, **options)
-    compiled = numba.njit(function, **options)
-    compiled._cache = _FunctionCache("njit", function, options)
+    compiled: F = numba.njit(function, **options)
+    vars(compiled)["_cache"] = _FunctionCache("njit", function, options)
     return compiled
 
 
-def cfunc(signature: Any, **options: Any) -> Callable[[Any], Any]:
+def cfunc(
+    signature: Signature, **options: object
+) -> Callable[[Callable[P, R]], CompiledCallback[P, R]]:
     """Compile a function as `numba.cfunc` does, with the cache on disk."""
 
-    def compiled(function: Any) -> Any:
-        compiled_callback: Any = CFunc(
+    def compiled(function: Callable[P, R]) -> CompiledCallback[P, R]:
+        compiled_callback = CFunc(
             function, sigutils.normalize_signature(signature), locals={}, options=options
         )
-        compiled_callback._cache = _FunctionCache("cfunc", function, options)
+        vars(compiled_callback)["_cache"] = _FunctionCache("cfunc", function, options)
         compiled_callback.compile()
-        return compiled_callback
+        return cast(CompiledCallback[P, R], compiled_callback)
 
     return compiled
 
@@ -137,7 +182,7 @@ def cfunc(signature: Any, **options: Any) -> Callable[[Any], Any]:
 class VerifiedMarker:
     """Empty file that records a passed check of values, such as a function and types."""
 
-    def __init__(self, label: str, *values: Any) -> None:
+    def __init__(self, label: str, *values: object) -> None:
         """Identify the check by a label and the values that it depends on."""
         self._path = _path(label, values)
 
@@ -151,10 +196,12 @@ class VerifiedMarker:
             _write(self._path, b"")
 
 
-class _FunctionCache(_Cache):  # type: ignore[misc]
+class _FunctionCache(_Cache):
     """Cache of one function's overloads, one for each signature, with the interface of numba."""
 
-    def __init__(self, kind: str, function: Any, options: Any) -> None:
+    def __init__(
+        self, kind: str, function: Callable[..., object], options: Mapping[str, object]
+    ) -> None:
         self._name = function.__name__
         self._key_values = (kind, tuple(sorted(options.items())), function)
 
@@ -172,7 +219,9 @@ class _FunctionCache(_Cache):  # type: ignore[misc]
     def flush(self) -> None:
         """Do nothing: files are written at once."""
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
+    def load_overload(
+        self, sig: Signature | tuple[types.Type, ...], target_context: BaseContext
+    ) -> CompileResult | None:
         """Load the overload for a signature; None if there is no usable file."""
         path = self._overload_path(sig)
         payload = None if path is None else _read(path)
@@ -186,7 +235,7 @@ class _FunctionCache(_Cache):  # type: ignore[misc]
             # An entry that numba cannot rebuild counts as missing: the function is compiled again.
             return None
 
-    def save_overload(self, sig: Any, data: Any) -> None:
+    def save_overload(self, sig: Signature | tuple[types.Type, ...], data: CompileResult) -> None:
         """Store an overload, unless it has parts that only this process can use."""
         path = self._overload_path(sig)
         if path is not None and not data.library.has_dynamic_globals and not data.lifted:
@@ -197,12 +246,12 @@ class _FunctionCache(_Cache):  # type: ignore[misc]
                 return
             _write(path, payload)
 
-    def _overload_path(self, sig: Any) -> Path | None:
+    def _overload_path(self, sig: Signature | tuple[types.Type, ...]) -> Path | None:
         """Return the file for a signature."""
         return _path(self._name, (*self._key_values, tuple(getattr(sig, "args", sig))))
 
 
-def _path(name: str, values: Any) -> Path | None:
+def _path(name: str, values: tuple[object, ...]) -> Path | None:
     """Return the file for values; None if nothing is stored, or a value cannot be hashed."""
     try:
         directory, key = cache_folder(), hashlib.sha256(_base_key())
@@ -306,7 +355,9 @@ def _source_of(module: str) -> bytes:
     return Path(path).read_bytes() if path and Path(path).is_file() else b""
 
 
-def _hash_value(key: Any, value: Any, names: tuple[str, ...], visited: dict[int, Any]) -> None:
+def _hash_value(
+    key: Digest, value: object, names: tuple[str, ...], visited: dict[int, object]
+) -> None:
     """Hash a value and everything it reaches; for a module only the attributes with these names."""
     if isinstance(value, _PLAIN_TYPES):
         key.update(f"{type(value).__qualname__} {value!r}\n".encode())
@@ -384,7 +435,9 @@ def _hash_value(key: Any, value: Any, names: tuple[str, ...], visited: dict[int,
             raise _UnhashableError(repr(value))
 
 
-def _hash_function(key: Any, function: Any, visited: dict[int, Any]) -> None:
+def _hash_function(
+    key: Digest, function: python_types.FunctionType, visited: dict[int, object]
+) -> None:
     """Hash a function's name and, outside `_VERSIONED_PACKAGES`, its code and all it refers to."""
     code = function.__code__
     scope = function.__globals__
@@ -414,7 +467,7 @@ def _hash_function(key: Any, function: Any, visited: dict[int, Any]) -> None:
             _hash_value(key, scope[name], names, visited)
 
 
-def _referenced_names(code: Any) -> tuple[str, ...]:
+def _referenced_names(code: python_types.CodeType) -> tuple[str, ...]:
     """Return the names of globals and attributes in a function and the functions inside it."""
     inner = (constant for constant in code.co_consts if isinstance(constant, python_types.CodeType))
     return (*code.co_names, *(name for constant in inner for name in _referenced_names(constant)))

@@ -6,7 +6,7 @@ The functions are plain Python on purpose: `codrl_mj.physics.disturber` compiles
 import dataclasses
 import math
 import warnings
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
@@ -102,9 +102,11 @@ class Joint(fields.Checked):
 
 UNMODIFIED_JOINT = Joint()
 """Settings of a joint to which nothing is added."""
+Settings = TypeVar("Settings", Disturbances, Joint)
+"""Disturbances or a joint."""
 
 
-def resolve(value: Any, default: Any) -> Any:
+def resolve(value: object, default: Settings) -> Settings:
     """Return a user's setting as `Disturbances` or `Joint`.
 
     Args:
@@ -164,12 +166,14 @@ def interpolate_delayed(newer: float, older: float, fraction: float) -> float:
 
 def quantize(command: float, quantum: float, limit: float) -> float:
     """Return the nearest multiple of the quantum, half to even, within +-limit, in [N or N*m]."""
-    return np.minimum(np.maximum(quantum * np.rint(command / quantum), -limit), limit)
+    rounded: float = np.minimum(np.maximum(quantum * np.rint(command / quantum), -limit), limit)
+    return rounded
 
 
 def limit_rate(command: float, before: float, change: float) -> float:
     """Return the command within `change` of the previous step's command, all in [N or N*m]."""
-    return np.minimum(np.maximum(command, before - change), before + change)
+    limited: float = np.minimum(np.maximum(command, before - change), before + change)
+    return limited
 
 
 PULSE_NAMES = ("key", "step", "index", "start")

@@ -1,12 +1,14 @@
 """Creation of single and vectorized environments: `make` and `make_vec`."""
 
 from collections.abc import Callable
-from typing import Any
 
+from codrl_mj.boundary import Argument
 from codrl_mj.envs.config import Env, EnvConfig, VecEnv
 
 
-def make(env: str | EnvConfig | Callable[..., Env], actuator: Any = None, **arguments: Any) -> Env:
+def make(
+    env: str | EnvConfig | Callable[..., Env], actuator: object = None, **arguments: Argument
+) -> Env:
     """Create an environment with motors behind its actuators.
 
         >>> env = codrl_mj.make("pendulum", "maxon-dcx22l")
@@ -37,8 +39,8 @@ def make(env: str | EnvConfig | Callable[..., Env], actuator: Any = None, **argu
 def make_vec(
     env: str | EnvConfig | Callable[..., Env],
     num_envs: int = 1,
-    actuator: Any = None,
-    **arguments: Any,
+    actuator: object = None,
+    **arguments: Argument,
 ) -> VecEnv:
     """Create a Gymnasium vector environment, by default in autoreset mode `SameStep`.
 

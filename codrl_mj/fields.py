@@ -15,7 +15,14 @@ import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard, TypeVar
+
+Kind = TypeVar("Kind")
+"""Dataclass that a mapping describes."""
+# A dataclass annotates a field with the type of its values and assigns the field to it, so type
+# checkers must accept a field as a value of any type.
+DeclaredField = Any
+"""Field of a dataclass."""
 
 
 def real(
@@ -27,7 +34,7 @@ def real(
     optional: bool = False,
     unit: str = "",
     infinite: bool = False,
-) -> Any:
+) -> DeclaredField:
     """Return a field for a finite number within bounds, stored as a float.
 
     Args:
@@ -46,7 +53,7 @@ def real(
         [kind, " and ".join(f"{sign}{limit:g}" for sign, limit in limits if limit is not None)]
     ).strip()
 
-    def is_valid(value: Any) -> bool:
+    def is_valid(value: object) -> bool:
         return (
             _is_real(value, infinite)
             and (above is None or value > above)
@@ -68,7 +75,7 @@ def integer(
     optional: bool = False,
     unit: str = "",
     maximum: float = math.inf,
-) -> Any:
+) -> DeclaredField:
     """Return a field for an integer >= `minimum`.
 
     None is allowed with `optional` or a default of None.
@@ -86,21 +93,21 @@ def integer(
     )
 
 
-def flag(default: bool) -> Any:
+def flag(default: bool) -> DeclaredField:
     """Return a field for True or False."""
     return _bounded(default, lambda value: isinstance(value, bool), "true or false")
 
 
-def choice(default: str, *options: str) -> Any:
+def choice(default: str, *options: str) -> DeclaredField:
     """Return a field for one of several options; parameter vectors store the option's index."""
     field = _bounded(default, lambda value: value in options, f"one of {', '.join(options)}")
     return dataclasses.field(default=default, metadata={**field.metadata, "options": options})
 
 
-def positive_integers(default: tuple[int, ...]) -> Any:
+def positive_integers(default: tuple[int, ...]) -> DeclaredField:
     """Return a field for a tuple of positive integers, such as the sizes of hidden layers."""
 
-    def is_valid(value: Any) -> bool:
+    def is_valid(value: object) -> bool:
         return isinstance(value, tuple) and all(
             _is_integer(count) and count >= 1 for count in value
         )
@@ -108,19 +115,19 @@ def positive_integers(default: tuple[int, ...]) -> Any:
     return _bounded(default, is_valid, "a tuple of integers >= 1")
 
 
-def positive_reals(default: tuple[float, ...] | None = None) -> Any:
+def positive_reals(default: tuple[float, ...] | None = None) -> DeclaredField:
     """Return an optional field for a tuple of finite numbers > 0."""
 
-    def is_valid(value: Any) -> bool:
+    def is_valid(value: object) -> bool:
         return isinstance(value, tuple) and all(_is_real(number) and number > 0 for number in value)
 
     return _bounded(default, is_valid, "a tuple of finite numbers > 0")
 
 
-def reals(default: tuple[float, ...] | None = None) -> Any:
+def reals(default: tuple[float, ...] | None = None) -> DeclaredField:
     """Return an optional field for a tuple of finite numbers."""
 
-    def is_valid(value: Any) -> bool:
+    def is_valid(value: object) -> bool:
         return isinstance(value, tuple) and all(_is_real(number) for number in value)
 
     return _bounded(default, is_valid, "a tuple of finite numbers")
@@ -177,7 +184,7 @@ def check_memory(size: float, purpose: str, remedy: str) -> None:
 
 
 def check_names(
-    names: Iterable[Any],
+    names: Iterable[object],
     known: Iterable[str],
     label: str,
     prefix: str = "",
@@ -218,9 +225,9 @@ def check_names(
             raise ValueError(f"unknown {label} {prefix}{name}; {' '.join(hints)}")
 
 
-def flatten(mapping: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(mapping: Mapping[str, object], prefix: str = "") -> dict[str, object]:
     """Return the values in nested mappings by dotted names."""
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     for key, value in mapping.items():
         values |= (
             flatten(value, f"{prefix}{key}.")
@@ -230,7 +237,9 @@ def flatten(mapping: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return values
 
 
-def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+def differences(
+    first: Mapping[str, object], second: Mapping[str, object]
+) -> dict[str, tuple[object, object]]:
     """Return the values in which two mappings differ, by dotted names.
 
     Each is a pair; `absent` stands for a missing value.
@@ -255,7 +264,7 @@ def check_pattern(pattern: str) -> None:
         ) from None
 
 
-def check_joint_dynamics(value: Any) -> None:
+def check_joint_dynamics(value: object) -> None:
     """Raise if a value is not valid for `joint_dynamics` of `codrl_mj.add_motors`."""
     if value not in (None, "keep", "replace"):
         raise ValueError(
@@ -327,41 +336,43 @@ def field_docs(kind: type) -> Mapping[str, str]:
     return docs
 
 
-def build(cls: type, mapping: object, label: str, prefix: str = "") -> Any:
+def build(cls: type[Kind], mapping: object, label: str, prefix: str = "") -> Kind:
     """Build a dataclass, with nested ones, from nested mappings; missing fields take defaults."""
+    kind: type = cls
     if not isinstance(mapping, Mapping):
         raise ValueError(
             f"{label} {prefix.rstrip('.')!r} = {mapping!r}: must be a mapping of {cls.__name__}'s"
             " fields"
         )
-    nested = nested_types(cls)
+    nested = nested_types(kind)
     absent = {
         field.name: field.metadata["absent"]
-        for field in dataclasses.fields(cls)
+        for field in dataclasses.fields(kind)
         if "absent" in field.metadata
     }
     inner = [
         f"{name}.{field.name}"
-        for name, kind in nested.items()
-        for field in dataclasses.fields(kind)
+        for name, part in nested.items()
+        for field in dataclasses.fields(part)
     ]
     check_names(
-        mapping, (field.name for field in dataclasses.fields(cls)), label, prefix, nested=inner
+        mapping, (field.name for field in dataclasses.fields(kind)), label, prefix, nested=inner
     )
 
-    def convert(key: str, value: Any) -> Any:
+    def convert(key: str, value: object) -> object:
         """Return a nested mapping as its dataclass; other values are returned unchanged."""
         if key not in nested or value is None or isinstance(value, nested[key]):
             return value
         if isinstance(value, Mapping) and key in absent:
             # The mapping changes only some values of the part, so the others come from its default.
             value = {**dataclasses.asdict(absent[key]), **value}
-        return build(nested[key], value, label, f"{prefix}{key}.")
+        part: object = build(nested[key], value, label, f"{prefix}{key}.")
+        return part
 
     return cls(**{key: convert(key, value) for key, value in mapping.items()})
 
 
-def optional_nested(absent: Any) -> Any:
+def optional_nested(absent: object) -> DeclaredField:
     """Return a field for an optional nested dataclass; None, the default, stands for `absent`."""
     return dataclasses.field(default=None, metadata={"absent": absent})
 
@@ -378,7 +389,7 @@ def nested_types(cls: type) -> dict[str, type]:
 
 
 @functools.cache
-def declared_nested_types(cls: Any) -> dict[str, Any]:
+def declared_nested_types(cls: type) -> dict[str, type | types.UnionType]:
     """Return field -> declared type, for nested dataclasses declared as a class or a union."""
     # Names that only a type checker imports cannot be resolved at run time.
     try:
@@ -392,14 +403,14 @@ def declared_nested_types(cls: Any) -> dict[str, Any]:
 
 
 def _bounded(
-    default: Any,
-    is_valid: Callable[[Any], bool],
+    default: object,
+    is_valid: Callable[[object], bool],
     text: str,
     optional: bool = False,
     unit: str = "",
     kind: type | None = None,
     between: tuple[float | None, float | None] = (None, None),
-) -> Any:
+) -> DeclaredField:
     """Return a field with its check, its unit and its range as metadata."""
     metadata = {
         "bound": (is_valid, text, optional or default is None, kind),
@@ -409,12 +420,13 @@ def _bounded(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def _is_real(value: Any, infinite: bool = False) -> bool:
-    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    return real and (math.isfinite(value) or (infinite and math.isinf(value)))
+def _is_real(value: object, infinite: bool = False) -> TypeGuard[float]:
+    if not isinstance(value, numbers.Real) or isinstance(value, bool):
+        return False
+    return math.isfinite(value) or (infinite and math.isinf(value))
 
 
-def _is_integer(value: Any) -> bool:
+def _is_integer(value: object) -> TypeGuard[int]:
     return isinstance(value, numbers.Integral) and not isinstance(value, bool)
 
 

@@ -10,7 +10,7 @@ therefore two Python functions. When the first model calls them, the other funct
 import ctypes
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import mujoco
 
@@ -79,7 +79,7 @@ def library() -> ctypes.CDLL:
     )
 
 
-def registered_plugins() -> dict[str, tuple[int, Any]]:
+def registered_plugins() -> dict[str, tuple[int, Plugin]]:
     """Return name -> (slot, structure) of every plugin that MuJoCo knows."""
     mujoco_library = library()
     plugin_at_slot = mujoco_library.mjp_getPluginAtSlot
@@ -90,7 +90,7 @@ def registered_plugins() -> dict[str, tuple[int, Any]]:
     return {plugin.name.decode(): (slot, plugin) for slot, plugin in plugins}
 
 
-def check_structure(plugins: dict[str, tuple[int, Any]]) -> None:
+def check_structure(plugins: dict[str, tuple[int, Plugin]]) -> None:
     """Raise if `Plugin` does not describe the structure that MuJoCo filled for `mujoco.pid`."""
     pid = plugins["mujoco.pid"][1] if "mujoco.pid" in plugins else Plugin()
     attributes = (
@@ -111,13 +111,26 @@ def check_structure(plugins: dict[str, tuple[int, Any]]) -> None:
         )
 
 
-_BACKEND: list[Callable[[], Any]] = []
+class Backend(Protocol):
+    """The module with the compiled functions, `codrl_mj.engine.plugin`.
+
+    Its functions get the addresses of `mjModel` and `mjData`.
+    """
+
+    def num_states(self, model: int, instance: int) -> int:
+        """Return `nstate`, the number of states of an instance."""
+
+    def start(self, model: int, data: int, instance: int) -> int:
+        """Replace the functions of the plugin, and run `init`."""
+
+
+_BACKEND: list[Callable[[], Backend]] = []
 """Function that returns the module with the compiled functions, once the plugin is registered."""
-_REFERENCES: list[Any] = []
+_REFERENCES: list[object] = []
 """Objects to whose memory MuJoCo has pointers; they must never be freed."""
 
 
-def register(load_backend: Callable[[], Any]) -> None:
+def register(load_backend: Callable[[], Backend]) -> None:
     """Register the plugin; a no-op if this module has done so before.
 
     Args:

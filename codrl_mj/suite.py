@@ -11,12 +11,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import dm_env
-import gymnasium
 import numpy as np
 from dm_env import specs
 from gymnasium import spaces
 
-from codrl_mj.envs.config import EnvConfig
+from codrl_mj.boundary import Action, Argument, AttributeValue, Info, Observation, PickledState
+from codrl_mj.envs.config import Env, EnvConfig
 from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
 from codrl_mj.external_envs import check_dm_control
 from codrl_mj.tasks import TASKS
@@ -24,7 +24,7 @@ from codrl_mj.tasks import TASKS
 TASK_NAME = "gym"
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Return `ALL_TASKS`: (domain, task) of all tasks at present, including custom ones."""
     if name == "ALL_TASKS":
         return tuple((domain, TASK_NAME) for domain in TASKS)
@@ -38,9 +38,7 @@ class DmEnvironment(dm_env.Environment):
     with the actuators' signals, is in `info`.
     """
 
-    def __init__(
-        self, env: "gymnasium.Env[Any, Any]", random: Any = None, flat_observation: bool = False
-    ) -> None:
+    def __init__(self, env: Env, random: object = None, flat_observation: bool = False) -> None:
         """Wrap an environment.
 
         Args:
@@ -49,12 +47,12 @@ class DmEnvironment(dm_env.Environment):
             flat_observation: True for a single vector, `observations`, even if the entries have
                 names; third-party observations without names always are.
         """
-        self.env, self.info = env, dict[str, Any]()
+        self.env, self.info = env, Info()
         self._ended, self._seed = True, None
         if isinstance(random, np.random.Generator):
             env.unwrapped.np_random = random
         elif random is not None:
-            self._seed = operator.index(random)
+            self._seed = operator.index(random)  # type: ignore[arg-type]  # it raises TypeError
         self._names = () if flat_observation else getattr(env.unwrapped, "observation_names", ())
         # A dm_control.mujoco.Physics; dm_control is imported on first use.
         self._physics: Any = None
@@ -65,7 +63,7 @@ class DmEnvironment(dm_env.Environment):
         self._seed, self._ended = None, False
         return dm_env.restart(self._entries(observation))
 
-    def step(self, action: Any) -> dm_env.TimeStep:
+    def step(self, action: Action) -> dm_env.TimeStep:
         """Advance by one environment step; the step after the end of an episode resets.
 
         If the task terminates an episode, the last discount is 0; at the time limit it is 1. If
@@ -88,7 +86,7 @@ class DmEnvironment(dm_env.Environment):
         discount = 0.0 if terminated and not truncated else 1.0
         return dm_env.TimeStep(kind, reward, discount, self._entries(observation))
 
-    def _entries(self, observation: Any) -> dict[str, np.ndarray]:
+    def _entries(self, observation: Observation) -> dict[str, np.ndarray]:
         """Return the observation's entries by name, floating-point ones in float64."""
         entries = observation if isinstance(observation, dict) else {"observations": observation}
         if self._names:
@@ -116,7 +114,7 @@ class DmEnvironment(dm_env.Environment):
         return specs.BoundedArray(space.shape, space.dtype, space.low, space.high, name="action")
 
     @property
-    def physics(self) -> Any:
+    def physics(self) -> Any:  # mypy does not read dm_control
         """The present model and data as a `dm_control.mujoco.Physics`.
 
         It offers named indexing, `render` and `reset_context`. Steps must be the environment's own;
@@ -172,24 +170,24 @@ class DmEnvironment(dm_env.Environment):
         """Close the environment."""
         self.env.close()
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> AttributeValue:
         """Return another attribute of the environment."""
         if name.startswith("__") or name == "env":
             raise AttributeError(name)
         return self.env.get_wrapper_attr(name)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> PickledState:
         """Return all but the view of the simulation; a copy makes a new one."""
         return self.__dict__ | {"_physics": None}
 
 
 def load(
-    domain_name: Any,
+    domain_name: Argument,
     task_name: str = TASK_NAME,
-    actuator: Any = None,
-    task_kwargs: Mapping[str, Any] | None = None,
-    environment_kwargs: Mapping[str, Any] | None = None,
-    **options: Any,
+    actuator: object = None,
+    task_kwargs: Mapping[str, Argument] | None = None,
+    environment_kwargs: Mapping[str, Argument] | None = None,
+    **options: Argument,
 ) -> DmEnvironment:
     """Load a task as a dm_env environment.
 

@@ -17,17 +17,27 @@ import sysconfig
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
 from codrl_mj import fields
 
-Form = Any
+Form: TypeAlias = "str | tuple[Form, ...]"
 """Expected structure of a return value: the name of a number, or a tuple of such structures."""
 
 
-def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+# A user's function returns anything; `check_form` checks it.
+UserFunction = Callable[..., Any]
+"""A function that a user wrote."""
+Value = TypeVar("Value")
+# A user's file or module may contain anything; the functions that load it check it.
+Loaded = Any
+"""The content of a file, or an object that was loaded by its name or returned by a function."""
+
+
+def call(name: str, function: UserFunction, *arguments: object) -> Loaded:
     """Call a user's function; errors name it as `name`."""
     if not inspect.isfunction(function):
         raise ValueError(f"{name} = {function!r}: must be a function in plain Python")
@@ -44,13 +54,13 @@ def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         raise ValueError(f"{location}: {type(error).__name__}: {error}") from error
 
 
-def source_location(function: Callable[..., Any], line: int | None = None) -> str:
+def source_location(function: UserFunction, line: int | None = None) -> str:
     """Return file, line (default: its first) and name of a function, for messages."""
     code = function.__code__
     return f"{Path(code.co_filename).name}:{line or code.co_firstlineno}, in {code.co_name}"
 
 
-def check_form(function: Callable[..., Any], value: Any, form: Form, declared: str) -> Any:
+def check_form(function: UserFunction, value: Value, form: Form, declared: str) -> Value:
     """Return a function's return value, after checking that it has the expected form.
 
     Args:
@@ -67,7 +77,7 @@ def check_form(function: Callable[..., Any], value: Any, form: Form, declared: s
     return value
 
 
-def _fits(value: Any, form: Form) -> bool:
+def _fits(value: object, form: Form) -> bool:
     if isinstance(form, str):
         # Functions such as np.where return arrays without dimensions.
         scalar = isinstance(value, np.ndarray) and value.shape == () and value.dtype.kind in "biuf"
@@ -75,7 +85,7 @@ def _fits(value: Any, form: Form) -> bool:
     return isinstance(value, tuple) and len(value) == len(form) and all(map(_fits, value, form))
 
 
-def _describe_value(value: Any) -> str:
+def _describe_value(value: object) -> str:
     """Describe a returned value, or a type that numba inferred, by its name."""
     if isinstance(value, tuple):
         flat = _fits(value, ("",) * len(value))
@@ -86,15 +96,15 @@ def _describe_value(value: Any) -> str:
 def _describe_form(form: Form) -> str:
     if isinstance(form, str):
         return "a number"
-    flat = all(isinstance(entry, str) for entry in form)
+    names = [entry for entry in form if isinstance(entry, str)]
     return (
-        f"a tuple of {len(form)} ({', '.join(form)})"
-        if flat
+        f"a tuple of {len(form)} ({', '.join(names)})"
+        if len(names) == len(form)
         else f"({', '.join(map(_describe_form, form))})"
     )
 
 
-def compile_error_message(function: Callable[..., Any], error: Exception) -> str:
+def compile_error_message(function: UserFunction, error: Exception) -> str:
     """Return numba's error about a function that it cannot compile, as one sentence."""
     text = str(error)
     lines = [
@@ -163,7 +173,7 @@ def read_text(path: Path) -> str:
         ) from None
 
 
-def read_yaml(path: Path) -> Any:
+def read_yaml(path: Path) -> Loaded:
     """Read a YAML or JSON file, with the numbers of YAML 1.2 and JSON, such as 3e-4 and Infinity.
 
     For example, 20:1 is text here; YAML 1.1 would read it as the number 1201.
@@ -174,14 +184,17 @@ def read_yaml(path: Path) -> Any:
     import yaml
 
     class Loader(yaml.SafeLoader):
-        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        def construct_mapping(
+            self, node: yaml.MappingNode, deep: bool = False
+        ) -> dict[object, object]:
             keys = [key.value for key, _ in node.value]
             for key, _ in node.value[::-1]:
                 if keys.count(key.value) > 1 and key.value != "<<":
                     raise ValueError(
                         f"line {key.start_mark.line + 1}: {key.value} is given twice: leave one out"
                     )
-            return super().construct_mapping(node, deep)
+            mapping: dict[object, object] = super().construct_mapping(node, deep)
+            return mapping
 
     patterns = {
         "int": r"[-+]?(0|[1-9][\d_]*)$|0x[\da-fA-F]+$",
@@ -225,7 +238,7 @@ def allow_imports_from_files() -> contextlib.AbstractContextManager[None]:
     return allow_imports(_IMPORTS_ALLOWED.get() and FILES_TRUSTED.get())
 
 
-def load_module(text: str) -> Any:
+def load_module(text: str) -> ModuleType:
     """Import the module of `module:NAME`."""
     module = text.partition(":")[0]
     if not _IMPORTS_ALLOWED.get():
@@ -276,7 +289,7 @@ def _origin(error: Exception) -> tuple[str, bool]:
     return f"{file}, line {line}", Path(frames[-1].filename).is_relative_to(package)
 
 
-def load_object(text: str) -> Any:
+def load_object(text: str) -> Loaded:
     """Load the object at `module:NAME`."""
     module, name = load_module(text), text.partition(":")[2]
     try:
@@ -291,12 +304,12 @@ def load_object(text: str) -> Any:
 
 def look_up(
     name: str,
-    known: Mapping[str, Any],
+    known: Mapping[str, Value],
     label: str,
     allow_user_code: bool = True,
     base_class: type | None = None,
     suggestions: Mapping[str, Iterable[str]] | None = None,
-) -> Any:
+) -> Value:
     """Return the value for a name: one of `known`, or the object at `module:NAME`.
 
     Args:
@@ -310,7 +323,7 @@ def look_up(
     if isinstance(name, str) and name in known:
         return known[name]
     if allow_user_code and ":" in str(name):
-        value = load_object(name)
+        value: Value = load_object(name)
         if base_class is None or (isinstance(value, type) and issubclass(value, base_class)):
             return value
         raise ValueError(

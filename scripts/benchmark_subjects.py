@@ -150,7 +150,8 @@ def without_motors(env_id: str, actuator: str) -> Subject:
     """Return an environment with the inertia and friction that an actuator adds, but no motors."""
     env = gymnasium.make(env_id, disable_env_checker=True)
     plain: Any = env.unwrapped
-    model = codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True).unwrapped.model  # type: ignore[attr-defined]
+    actuated: Any = codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True).unwrapped
+    model = actuated.model
     # The engine's cost depends on these fields too, so they are the same with and without motors.
     for field in (
         "actuator_armature",

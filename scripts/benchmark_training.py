@@ -237,7 +237,7 @@ def with_rltools(task: str, seed: int, watch: Watch) -> None:
 
     if task != "pendulum":
         raise NotImplementedError("its SAC has continuous actions")
-    returns: collections.deque = collections.deque(maxlen=100)
+    returns: collections.deque[float] = collections.deque(maxlen=100)
 
     class Counted(gymnasium.Wrapper):
         total = 0.0
@@ -304,9 +304,10 @@ def with_envpool(task: str, seed: int, watch: Watch) -> None:
     def act(observations: np.ndarray) -> np.ndarray:
         with torch.no_grad():
             out = actor(torch.as_tensor(observations, dtype=torch.float32) * scale)
-        return out.argmax(1).numpy() if discrete else np.clip(out.numpy(), -2.0, 2.0)
+        actions: np.ndarray = out.argmax(1).numpy() if discrete else np.clip(out.numpy(), -2.0, 2.0)
+        return actions
 
-    returns: collections.deque = collections.deque(maxlen=100)
+    returns: collections.deque[float] = collections.deque(maxlen=100)
     total, steps = np.zeros(count), 0
     observation = torch.as_tensor(envs.reset()[0], dtype=torch.float32)
     # EnvPool's first step after an episode's end is a reset; its reward and action do not count.

@@ -360,12 +360,16 @@ def third_party_environments() -> Entries:
             gym_env = codrl_mj.make(env_id, allow_unstable=True, **arguments)
             yield f"others/{env_id}/{name}", rollout_digest(gym_env)
     for name in ("ideal", "drive", "drawn"):
-        arguments = {"randomize": None} | {
+        dm_arguments: dict[str, Any] = {"randomize": None} | {
             key: variants[name][key] for key in variants[name] if key != "observe_actuator"
         }
-        options = {"task_kwargs": {"random": 1}, "noise_seed": 3, "allow_unstable": True}
+        options: dict[str, Any] = {
+            "task_kwargs": {"random": 1},
+            "noise_seed": 3,
+            "allow_unstable": True,
+        }
         env = codrl_mj.make_dm_control(
-            "cheetah/run", arguments.pop("actuator"), **options, **arguments
+            "cheetah/run", dm_arguments.pop("actuator"), **options, **dm_arguments
         )
         generator, arrays = np.random.default_rng(1), []
         env.reset()

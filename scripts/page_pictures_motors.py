@@ -15,9 +15,9 @@ from PIL import Image
 
 from codrl_mj.actuators import Drive, GearMotor, Lag, SampledLoop, Supply, TorqueSpeed
 from codrl_mj.cli import main
+from codrl_mj.plots import Curve, Plot, save_png
 from codrl_mj.study.bench import BLOCKED_INERTIA, make_bench
 from codrl_mj.tasks import PAPER_TASKS, named_actuator
-from codrl_mj.viz.pages.plots import Curve, Plot, save_png
 
 DOCS = Path(__file__).parents[1] / "docs"
 

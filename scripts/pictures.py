@@ -13,6 +13,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -151,8 +152,9 @@ def tasks(out: Path) -> None:
     for name in TASKS:
         env = codrl_mj.make(name, render_mode="rgb_array", width=480, height=360, pretty=True)
         env.reset(seed=0)
-        env.unwrapped.state = np.array(POSES[name])  # type: ignore[attr-defined]
-        frames[name] = env.render()
+        unwrapped: Any = env.unwrapped
+        unwrapped.state = np.array(POSES[name])
+        frames[name] = np.asarray(env.render())
         env.close()
     smaller(sheet(frames, 3), out)
 
@@ -164,9 +166,10 @@ def robots(out: Path) -> None:
         env = codrl_mj.make(name, actuator, render_mode="rgb_array", width=480, height=360)
         env.action_space.seed(0)
         env.reset(seed=0)
-        for _ in range(math.ceil(0.4 / env.unwrapped.dt)):  # type: ignore[attr-defined]
+        unwrapped: Any = env.unwrapped
+        for _ in range(math.ceil(0.4 / unwrapped.dt)):
             env.step(env.action_space.sample())
-        frames[f"{name} on {actuator}"] = env.render()
+        frames[f"{name} on {actuator}"] = np.asarray(env.render())
         env.close()
     smaller(sheet(frames, 2), out)
 

@@ -90,7 +90,7 @@ def soak(task: str, num_envs: int, steps: int) -> int:
     first, _ = (env.reset(seed=0)[1] for env in envs)
     rejected = int(first["randomization"]["rejected"].sum())
     draws, num_unstable = num_envs, unstable(envs[0])
-    space = envs[0].single_action_space
+    space: Any = envs[0].single_action_space
     lengths = np.zeros(num_envs, dtype=np.int64)
     ended = truncations = finished_steps = differing = unaccounted = 0
     base, start = 0, time.perf_counter()
@@ -98,7 +98,7 @@ def soak(task: str, num_envs: int, steps: int) -> int:
         if isinstance(space, Discrete):
             actions = generator.integers(space.n, size=num_envs)
         else:
-            actions = generator.uniform(space.low, space.high, (num_envs, 1)).astype(np.float32)  # type: ignore[attr-defined]
+            actions = generator.uniform(space.low, space.high, (num_envs, 1)).astype(np.float32)
         single_threaded, two_threaded = (env.step(actions) for env in envs)
         differing += digest(single_threaded) != digest(two_threaded)
         _, _, terminated, truncated, infos = single_threaded

@@ -174,7 +174,7 @@ class Agent(nn.Module):
         """Return the expected discounted return (...,), in units of the scale in `train`."""
         return self.critic(self.seen(observations)).squeeze(-1)
 
-    @torch.no_grad()
+    @torch.no_grad()  # type: ignore[untyped-decorator]
     def act(self, observations: np.ndarray, greedy: bool = True) -> tuple[Tensor, np.ndarray]:
         """Return actions for observations (n, k): as the policy draws them, and as commands."""
         policy = self.policy(torch.as_tensor(observations))

@@ -268,6 +268,21 @@ def test_all_links_of_a_page_exist(page):
             assert str(target.resolve().relative_to(ROOT)) not in NOT_CLONED, link
 
 
+def _anchors(text):
+    """Return the anchors of a page's headings, as GitHub and the site's generator make them."""
+    headings = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.M)
+    plain = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading) for heading in headings)
+    return {re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in plain}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_all_links_to_a_section_exist(page):
+    for target, anchor in re.findall(r"\]\(([^)#:]*)#([^)]+)\)", PAGES[page]):
+        path = (ROOT / page).parent / target if target else ROOT / page
+        if path.suffix == ".md":
+            assert anchor in _anchors(path.read_text()), f"{target}#{anchor}"
+
+
 TEXTS = ("*.py", "*.toml", "*.xml", "*.jinja", "*.md", "*.html", "*.js", "*.yml", "Makefile")
 """Files that may name a page: messages, help, docstrings, generated files."""
 

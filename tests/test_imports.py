@@ -1,9 +1,12 @@
 """Effects of `import codrl_mj` in a process that has not imported anything yet."""
 
+import ast
+import importlib
 import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -104,3 +107,18 @@ def test_every_public_name_can_be_imported_and_listed():
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="module 'codrl_mj' has no attribute 'Actuators'"):
         _ = codrl_mj.Actuators
+
+
+@pytest.mark.parametrize("package", ["codrl_mj", "codrl_mj.envs"])
+def test_the_stub_of_a_package_has_its_public_names(package):
+    """Type checkers and editors read the names that `__init__.py` imports on first use there."""
+    module = importlib.import_module(package)
+    tree = ast.parse(Path(module.__file__).with_suffix(".pyi").read_text())
+    imported = {
+        alias.asname: node.module
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if alias.asname
+    }
+    assert imported == module._PUBLIC

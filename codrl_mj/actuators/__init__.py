@@ -28,6 +28,7 @@ from codrl_mj.actuators.model import (
 )
 from codrl_mj.actuators.named import (
     NAMED,
+    ActuatorSetting,
     actuator_from_mapping,
     check_same_family,
     combined_name,
@@ -63,6 +64,7 @@ __all__ = [
     "NAMED",
     "DCMotorActuator",
     "ActuatorModel",
+    "ActuatorSetting",
     "Command",
     "CurrentLoop",
     "Drive",

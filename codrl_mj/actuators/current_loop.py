@@ -10,12 +10,13 @@ plugin, and the same source runs uncompiled in the analytic physics and in the s
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import noise, stability
 from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, UnstableError
+from codrl_mj.actuators.parameters import FieldValue, Parameters
 from codrl_mj.fields import Checked, flag, integer, optional_nested, real
 
 
@@ -142,7 +143,7 @@ class Signals(NamedTuple):
 
 
 def advance(
-    parameters: Any, timestep: float, state: State, inputs: Inputs
+    parameters: Parameters, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Signals]:
     """Advance the loop by one mechanical step, with desired torque and speed held over it.
 
@@ -204,20 +205,20 @@ def advance(
 
 
 def electrical_step(
-    parameters: Any,
+    parameters: Parameters,
     dt: float,
-    current: Any,
-    integral: Any,
-    previous_error: Any,
+    current: float,
+    integral: float,
+    previous_error: float,
     desired_torque: float,
     speed: float,
     sensor_error: float,
-    limit: Any,
-) -> tuple[Any, Any, Any, Any]:
+    limit: float,
+) -> tuple[float, float, float, float]:
     """Advance controller and winding by one sample; all uses of the equations call this.
 
     Args:
-        parameters: as for `advance`; each may be an array.
+        parameters: as for `advance`. The stability analysis passes arrays of parameters and states.
         dt: electrical step [s].
         current: [A].
         integral: [A*s].
@@ -249,7 +250,7 @@ def electrical_step(
 
 
 def observe(
-    parameters: Any, timestep: float, signals: Signals, inputs: Inputs
+    parameters: Parameters, timestep: float, signals: Signals, inputs: Inputs
 ) -> tuple[float, float]:
     """Return the measured current [A] of the next electrical step, and the reference [A]."""
     error = parameters.current_bias
@@ -268,9 +269,9 @@ class DCMotorActuator(ActuatorModel):
     """Motor and current loop between the desired force and the delivered force."""
 
     family: ClassVar[str] = "current_loop"
-    electrical_step: ClassVar = staticmethod(electrical_step)
-    State: ClassVar[type] = State
-    Signals: ClassVar[type] = Signals
+    electrical_step: ClassVar[stability.ElectricalStep] = staticmethod(electrical_step)
+    State: ClassVar[type[NamedTuple]] = State
+    Signals: ClassVar[type[NamedTuple]] = Signals
     SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {
         "current": "A",
         "reference_current": "A",
@@ -383,13 +384,13 @@ class DCMotorActuator(ActuatorModel):
             columns.supply_resistance > 0.0, np.maximum(radii, np.abs(1.0 - pole)), radii
         )
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> dict[str, FieldValue]:
         """Return the mapping that `actuator_from_mapping` reads; the default family is left out."""
         return dataclasses.asdict(self) if type(self) is DCMotorActuator else super().as_mapping()
 
 
 def _advance_driven(
-    parameters: Any, timestep: float, state: State, inputs: Inputs
+    parameters: Parameters, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Signals]:
     """Run `advance`, and report the current as its own reference.
 
@@ -404,7 +405,7 @@ def _advance_driven(
 
 
 def _observe_driven(
-    parameters: Any, timestep: float, signals: Signals, inputs: Inputs
+    parameters: Parameters, timestep: float, signals: Signals, inputs: Inputs
 ) -> tuple[float, float]:
     """Return the measured current [A], which is also its own reference."""
     measured, _ = observe(parameters, timestep, signals, inputs)

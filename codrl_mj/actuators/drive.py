@@ -10,18 +10,26 @@ the torque that moved the load.
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from codrl_mj.actuators import sampled, shaft, stability
 from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.gear_motor import GearMotor
-from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, JointAdditions, UnstableError
-from codrl_mj.actuators.parameters import parameters_type
+from codrl_mj.actuators.model import (
+    ActuatorModel,
+    Command,
+    FamilyTuple,
+    Inputs,
+    JointAdditions,
+    UnstableError,
+)
+from codrl_mj.actuators.parameters import Parameters, parameters_type
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
 from codrl_mj.actuators.shaft import Shaft, StepAverages, TemperatureRises, Winding
+from codrl_mj.catalogue import MotorParameters
 from codrl_mj.fields import optional_nested
 
 
@@ -75,7 +83,11 @@ class Signals(NamedTuple):
 
 
 def limit_current(
-    parameters: Any, timestep: float, heat: TemperatureRises, resistance: float, current: float
+    parameters: Parameters,
+    timestep: float,
+    heat: TemperatureRises,
+    resistance: float,
+    current: float,
 ) -> float:
     """Return the commanded current [A] within `max_current` and the thermal limit."""
     limit = parameters.max_current
@@ -85,7 +97,7 @@ def limit_current(
 
 
 def begin_step(
-    parameters: Any, timestep: float, state: Any, inputs: Inputs
+    parameters: Parameters, timestep: float, state: FamilyTuple, inputs: Inputs
 ) -> tuple[Winding, TemperatureRises, Shaft]:
     """Return winding, temperatures and shaft at the beginning of a step, from a drive's state."""
     inertia, external_acceleration = shaft.inertia_of(parameters, inputs.inertia), 0.0
@@ -105,7 +117,7 @@ def begin_step(
 
 
 def end_step(
-    parameters: Any,
+    parameters: Parameters,
     timestep: float,
     time: float,
     heat: TemperatureRises,
@@ -135,7 +147,7 @@ def end_step(
 
 
 def _advance(
-    parameters: Any, timestep: float, state: State, inputs: Inputs, closed: bool
+    parameters: Parameters, timestep: float, state: State, inputs: Inputs, closed: bool
 ) -> tuple[State, float, Signals]:
     """Advance a drive by one step, under a desired torque or, if not `closed`, a voltage.
 
@@ -172,14 +184,14 @@ def _advance(
 
 
 def advance(
-    parameters: Any, timestep: float, state: State, inputs: Inputs
+    parameters: Parameters, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Signals]:
     """Advance winding, loop and shaft by one mechanical step [s]; inputs are those of the rotor."""
     return _advance(parameters, timestep, state, inputs, True)
 
 
 def observe(
-    parameters: Any,  # noqa: ARG001
+    parameters: Parameters,  # noqa: ARG001
     timestep: float,  # noqa: ARG001
     signals: Signals,
     inputs: Inputs,  # noqa: ARG001
@@ -197,8 +209,8 @@ class Drive(ActuatorModel):
     """
 
     family: ClassVar[str] = "drive"
-    State: ClassVar[type] = State
-    Signals: ClassVar[type] = Signals
+    State: ClassVar[type[NamedTuple]] = State
+    Signals: ClassVar[type[NamedTuple]] = Signals
     SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {
         "current": "A",
         "reference_current": "A",
@@ -211,7 +223,7 @@ class Drive(ActuatorModel):
     INERTIA: ClassVar[bool] = True
     CLOSED: ClassVar[bool] = True
     """True if a current loop is closed around the winding."""
-    advance: ClassVar[Callable[..., Any]] = staticmethod(advance)
+    advance: ClassVar[Callable[..., tuple[FamilyTuple, float, FamilyTuple]]] = staticmethod(advance)
     observe: ClassVar = staticmethod(observe)
 
     motor: GearMotor = GearMotor()
@@ -222,7 +234,7 @@ class Drive(ActuatorModel):
     """Supply of the drive; None: 24 V without a resistance."""
 
     @classmethod
-    def from_motor_parameters(cls, parameters: Any) -> "Drive":
+    def from_motor_parameters(cls, parameters: MotorParameters) -> "Drive":
         """Return a drive for a motor, with its nominal voltage (or 24 V) and its peak current."""
         max_current, voltage = parameters.max_current, parameters.voltage
         loop = SampledLoop() if max_current is None else SampledLoop(max_current=max_current)
@@ -297,15 +309,15 @@ class Drive(ActuatorModel):
         return f"assumed, because not specified: {assumptions}" if assumptions else ""
 
     @classmethod
-    def from_parameter_values(cls, parameter_values: Any, arm_radius: float = 1.0) -> Any:
+    def from_parameter_values(
+        cls, parameter_values: Iterable[float], arm_radius: float = 1.0
+    ) -> Self:
         """Return the drive with these parameters.
 
         The arm is that between rotor and load; the gear ratio is one of the parameters.
         """
-        family: Any = cls
-        return super().from_parameter_values(
-            parameter_values, arm_radius * parameters_type(family)(*parameter_values).gear_ratio
-        )
+        gear_ratio = parameters_type(cls)(*parameter_values).gear_ratio
+        return super().from_parameter_values(parameter_values, arm_radius * gear_ratio)
 
     def commands(self) -> Mapping[str, Command]:
         """Return the commands `current` [A], within `max_current`, and terminal `voltage` [V]."""
@@ -435,7 +447,7 @@ _BYPASSED_BY_VOLTAGE = ("bandwidth", "kp", "ki", "anti_windup", "bemf_compensati
 
 
 def _advance_driven(
-    parameters: Any, timestep: float, state: State, inputs: Inputs
+    parameters: Parameters, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Signals]:
     """Run `advance` without the loop, and report the current as its own reference.
 
@@ -454,7 +466,7 @@ class VoltageDrive(Drive):
     advance: ClassVar = staticmethod(_advance_driven)
 
 
-def _radii(cls: Any, parameter_values: np.ndarray) -> np.ndarray:
+def _radii(cls: type[Drive], parameter_values: np.ndarray) -> np.ndarray:
     """Return the spectral radii over one sample, unsaturated and saturated, shape (m,)."""
     columns = stability.parameter_columns(cls, parameter_values)
     sample_time, resistance = 1.0 / columns.sample_rate, columns.resistance
@@ -491,4 +503,6 @@ def _radii(cls: Any, parameter_values: np.ndarray) -> np.ndarray:
     matrices = np.array(rows).transpose(2, 0, 1)
     radii = np.abs(np.linalg.eigvals(matrices).astype(np.complex128)).max(axis=1)
     # At its limit the voltage depends on the current through the supply's resistance.
-    return np.maximum(radii, np.abs(decay - current_per_volt * columns.supply_resistance))
+    limited = np.abs(decay - current_per_volt * columns.supply_resistance)
+    larger: np.ndarray = np.maximum(radii, limited)
+    return larger

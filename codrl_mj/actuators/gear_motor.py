@@ -2,11 +2,15 @@
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from codrl_mj.catalogue import MotorParameters, from_datasheet
 from codrl_mj.fields import Checked, real
+
+Numbers = TypeVar("Numbers", float, np.ndarray)
+"""A number, or an array of numbers."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,6 +110,7 @@ class GearMotor(Checked):
                 f" no resistance; must be above {25.0 - 1.0 / self.resistance_coefficient:g} degC"
             )
 
+    # The values are texts, except for the settings of the function that takes them.
     @classmethod
     def from_datasheet(cls, **printed: Any) -> "GearMotor":
         """Return a motor from the values of its datasheet, each a text with its unit.
@@ -123,12 +128,10 @@ class GearMotor(Checked):
             ValueError: the datasheet is not sufficient or contradicts itself; the message has
                 values and remedy.
         """
-        from codrl_mj.catalogue import from_datasheet
-
         return cls.from_motor_parameters(from_datasheet(**printed))
 
     @classmethod
-    def from_motor_parameters(cls, parameters: Any) -> "GearMotor":
+    def from_motor_parameters(cls, parameters: MotorParameters) -> "GearMotor":
         """Return a motor with `codrl_mj.catalogue.MotorParameters`.
 
         An unknown inertia or friction becomes 0; other unknown values become the fields' defaults.
@@ -148,11 +151,12 @@ class GearMotor(Checked):
             values["max_temperature"] = None
         return cls(**{name: value for name, value in values.items() if value is not None})
 
-    def stribeck(self, speed: Any) -> Any:
+    def stribeck(self, speed: Numbers) -> Numbers:
         """Return the Stribeck friction [N*m] at the rotor for a speed [rad/s] of any shape."""
-        return self.stribeck_friction * np.exp(
+        friction: Numbers = self.stribeck_friction * np.exp(
             -(np.abs(speed / self.stribeck_speed) ** self.stribeck_exponent)
         )
+        return friction
 
     @property
     def electrical_time_constant(self) -> float:

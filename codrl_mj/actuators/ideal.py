@@ -1,9 +1,10 @@
 """Ideal actuator, family `ideal`: it delivers the desired torque."""
 
 import dataclasses
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 from codrl_mj.actuators.model import ActuatorModel, Empty, Inputs
+from codrl_mj.actuators.parameters import Parameters
 
 
 class Signals(NamedTuple):
@@ -16,7 +17,7 @@ class Signals(NamedTuple):
 
 
 def advance(
-    parameters: Any,  # noqa: ARG001
+    parameters: Parameters,  # noqa: ARG001
     timestep: float,  # noqa: ARG001
     state: Empty,  # noqa: ARG001
     inputs: Inputs,
@@ -30,7 +31,7 @@ class Ideal(ActuatorModel):
     """Actuator without a motor: force = desired force."""
 
     family: ClassVar[str] = "ideal"
-    Signals: ClassVar[type] = Signals
+    Signals: ClassVar[type[NamedTuple]] = Signals
     advance: ClassVar = staticmethod(advance)
 
 

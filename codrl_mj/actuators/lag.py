@@ -3,11 +3,12 @@
 import dataclasses
 import math
 import warnings
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators.model import ActuatorModel, Empty, Inputs
+from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.fields import real
 
 HISTORY = 8
@@ -29,7 +30,7 @@ class State(NamedTuple):
 
 
 def advance(
-    parameters: Any, timestep: float, state: State, inputs: Inputs
+    parameters: Parameters, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Empty]:
     """Advance tau' = (gain*u(t - delay) - tau)/T exactly, with u held over a step.
 
@@ -85,7 +86,7 @@ class Lag(ActuatorModel):
     """
 
     family: ClassVar[str] = "lag"
-    State: ClassVar[type] = State
+    State: ClassVar[type[NamedTuple]] = State
     advance: ClassVar = staticmethod(advance)
 
     time_constant: float = real(0.05, minimum=0.0, unit="s")

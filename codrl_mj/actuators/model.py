@@ -10,13 +10,15 @@ import dataclasses
 import functools
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from codrl_mj import fields
 from codrl_mj.actuators.parameters import (
+    FieldValue,
+    Parameters,
     family_of,
     field_paths,
     from_values,
@@ -33,7 +35,9 @@ class Inputs(NamedTuple):
     """Inputs of an actuator in one mechanical step, held constant over the step."""
 
     desired_torque: float
-    """Desired torque at the shaft [N*m], or force [N]."""
+    """Desired torque at the shaft [N*m], or force [N]; for a family with `MOTION` the commanded
+    position [rad, m] or speed; for an agent that commands the voltage u, kT*u.
+    """
     position: float
     """Position of the shaft at the beginning of the step [rad] or [m]."""
     speed: float
@@ -47,6 +51,12 @@ class Inputs(NamedTuple):
     the model, for the state at the beginning of the step; `inf` for families without `INERTIA` and
     where it is unknown.
     """
+
+
+# Each family declares its own named tuples, and reads them by name. A method that overrides another
+# must accept what the other accepts, so the arguments of the base class have no narrower type.
+FamilyTuple = Any
+"""`State` or `Signals` of a family."""
 
 
 class UnstableError(ValueError):
@@ -83,15 +93,9 @@ class JointAdditions(NamedTuple):
     """Coulomb friction [N*m], or [N]."""
 
 
-# The precise type would be `type[ActuatorModel]`, but mypy treats that as unhashable, and families
-# are arguments of cached functions.
-Family = Any
-"""A subclass of `ActuatorModel`."""
-
-
-FAMILIES: dict[str, Any] = {}
+FAMILIES: dict[str, type["ActuatorModel"]] = {}
 """Built-in families by name. Custom families are referred to as `module:Class`."""
-BUILT_IN: list[Any] = []
+BUILT_IN: list[type["ActuatorModel"]] = []
 """Built-in families, including the nameless ones that their commands simulate."""
 
 
@@ -111,9 +115,9 @@ class ActuatorModel(fields.Checked):
     """Name of the family in mappings, files and on the command line. Optional: `module:Class` works
     without it.
     """
-    State: ClassVar[type] = Empty
+    State: ClassVar[type[NamedTuple]] = Empty
     """State of the actuator: a `NamedTuple` of floats, all 0 at the start of an episode."""
-    Signals: ClassVar[type] = Empty
+    Signals: ClassVar[type[NamedTuple]] = Empty
     """Signals after a step: a `NamedTuple` of floats. A signal named `saturated` is 1 while the
     actuator is at a limit; `voltage_saturated`, `current_saturated` and `temperature_saturated`
     tell which limit. Evaluations compute their electrical measures from the signals `current` [A]
@@ -135,8 +139,11 @@ class ActuatorModel(fields.Checked):
     MOTION: ClassVar[bool] = False
     """True if the command is a position [rad] or a speed [rad/s] of the shaft instead of a torque.
     """
+    # Families are arguments of cached functions. Mypy compares the instances' `__hash__` with that
+    # of the class, and would call the class unhashable without this annotation, which sets nothing.
+    __hash__: ClassVar[Callable[..., int]]
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
+    def __init_subclass__(cls, **kwargs: object) -> None:
         """Register a built-in family by its name; custom families are found as `module:Class`."""
         super().__init_subclass__(**kwargs)
         # Validation simulates edited copies of these modules. Their classes have the same import
@@ -151,7 +158,7 @@ class ActuatorModel(fields.Checked):
     def __post_init__(self) -> None:
         """Validate."""
         super().__post_init__()
-        family: Any = type(self)
+        family = type(self)
         kinds = fields.declared_nested_types(family)
         for field in dataclasses.fields(self) if kinds else ():
             value = getattr(self, field.name)
@@ -164,8 +171,8 @@ class ActuatorModel(fields.Checked):
 
     @staticmethod
     def advance(
-        parameters: Any, timestep: float, state: Any, inputs: Inputs
-    ) -> tuple[Any, float, Any]:
+        parameters: Parameters, timestep: float, state: FamilyTuple, inputs: Inputs
+    ) -> tuple[FamilyTuple, float, FamilyTuple]:
         """Advance the actuator by one mechanical step.
 
         The function must be pure and written in plain Python that numba can compile unchanged.
@@ -183,7 +190,7 @@ class ActuatorModel(fields.Checked):
 
     @staticmethod
     def observe(
-        parameters: Any, timestep: float, signals: Any, inputs: Inputs
+        parameters: Parameters, timestep: float, signals: FamilyTuple, inputs: Inputs
     ) -> tuple[float, ...]:
         """Return sensor readings of the signals, entries as in `OBSERVED`; compiled like `advance`.
 
@@ -309,7 +316,9 @@ class ActuatorModel(fields.Checked):
         )
 
     @classmethod
-    def from_parameter_values(cls, parameter_values: Any, arm_radius: float = 1.0) -> Any:
+    def from_parameter_values(
+        cls, parameter_values: Iterable[float], arm_radius: float = 1.0
+    ) -> Self:
         """Return the actuator with these parameters.
 
         Args:
@@ -325,7 +334,7 @@ class ActuatorModel(fields.Checked):
         values |= {path: arm_radius for path in field_paths(family_of(cls)) if is_arm(path)}
         return from_values(cls, values)
 
-    def replaced(self, values: Mapping[str, Any]) -> Self:
+    def replaced(self, values: Mapping[str, FieldValue]) -> Self:
         """Return a copy with new values of some fields.
 
         Args:
@@ -337,8 +346,8 @@ class ActuatorModel(fields.Checked):
         """
         whole = [field.name for field in dataclasses.fields(self)]
         fields.check_names(values, [*field_paths(family_of(self)), *whole], "actuator field")
-        changes: dict[str, Any] = {}
-        nested: dict[str, dict[str, Any]] = {}
+        changes: dict[str, FieldValue] = {}
+        nested: dict[str, dict[str, FieldValue]] = {}
         for path, value in values.items():
             name, _, rest = path.partition(".")
             if rest:
@@ -354,7 +363,7 @@ class ActuatorModel(fields.Checked):
         return dataclasses.replace(self, **changes)
 
     @classmethod
-    def from_mapping(cls, mapping: Mapping[str, Any]) -> Any:
+    def from_mapping(cls, mapping: Mapping[str, object]) -> Self:
         """Build an actuator from nested mappings; missing fields take the dataclasses' defaults.
 
         Args:
@@ -366,9 +375,15 @@ class ActuatorModel(fields.Checked):
         """
         return fields.build(cls, mapping, "actuator field")
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> dict[str, FieldValue]:
         """Return the nested mapping, including `family`, that `actuator_from_mapping` reads."""
         return {"family": family_name(family_of(self)), **dataclasses.asdict(self)}
+
+
+Family = type[ActuatorModel]
+"""A subclass of `ActuatorModel`."""
+Advance = Callable[[Parameters, float, FamilyTuple, Inputs], tuple[FamilyTuple, float, FamilyTuple]]
+"""`advance` of a family."""
 
 
 def advance_signature(cls: Family) -> tuple[Form, str]:
@@ -412,7 +427,7 @@ def check_family(cls: Family) -> None:
     parameters, step = parameters_type(cls)(*actuator.parameter_values), np.float64(1e-3)
     inputs = Inputs(*map(np.float64, (0.1, 0.2, 0.3, 0.0, 0.0, 1.0)))
     state, signals = (
-        kind(*map(np.float64, [0.0] * len(kind._fields))) for kind in (cls.State, cls.Signals)
+        kind._make(map(np.float64, [0.0] * len(kind._fields))) for kind in (cls.State, cls.Signals)
     )
     if cls.advance is ActuatorModel.advance:
         raise ValueError(f"{cls.__name__}: has no `advance`")

@@ -6,16 +6,21 @@ import functools
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard, TypeVar
 
 from codrl_mj.actuators.current_loop import CurrentLoop, DCMotorActuator
 from codrl_mj.actuators.drive import Drive
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name
+from codrl_mj.actuators.parameters import FieldValue
 from codrl_mj.actuators.servo import Servo
 from codrl_mj.user_code import allow_imports_from_files, look_up, read_yaml
 
+Named = TypeVar("Named", bound=ActuatorModel)
+"""Actuator that gets a display name."""
+ActuatorSetting = str | Path | ActuatorModel | Family | Mapping[str, FieldValue] | None
+"""User's setting for an actuator: see `resolve`."""
 NAMED: dict[str, tuple[str, Callable[[DCMotorActuator], ActuatorModel]]] = {
     "ideal": ("no motor, the actual force equals the desired one", lambda _: IDEAL),
     "paper": ("the paper's motor and gains for the task", lambda paper: paper),
@@ -51,7 +56,7 @@ def find_family(name: str) -> Family:
     return family
 
 
-def actuator_from_mapping(mapping: Mapping[str, Any]) -> Any:
+def actuator_from_mapping(mapping: Mapping[str, FieldValue]) -> ActuatorModel:
     """Return the actuator that a mapping of fields describes; `family` defaults to `current_loop`.
 
     Raises:
@@ -66,7 +71,7 @@ def actuator_from_mapping(mapping: Mapping[str, Any]) -> Any:
     return find_family(fields.pop("family", DCMotorActuator.family)).from_mapping(fields)
 
 
-def mapping_of(actuator: ActuatorModel) -> dict[str, Any] | None:
+def mapping_of(actuator: ActuatorModel) -> dict[str, FieldValue] | None:
     """Return an actuator as a JSON mapping that `resolve` reads; None for the ideal actuator."""
     return None if actuator == IDEAL else actuator.as_mapping()
 
@@ -78,7 +83,8 @@ def display_name(actuator: ActuatorModel, paper: DCMotorActuator | None = None) 
     the catalogue motor with the same values, whatever its gear, loop and supply. A current loop has
     the name of the matching variation of `paper`, or `custom`. All others have their family's name.
     """
-    kind, known = type(actuator), {}
+    kind = type(actuator)
+    known: Mapping[str, ActuatorModel | GearMotor] = {}
     if kind is DCMotorActuator:
         known = {name: vary(paper) for name, (_, vary) in NAMED.items()} if paper else {}
     elif kind is Drive and not display_label(actuator):
@@ -108,7 +114,7 @@ def display_label(actuator: ActuatorModel) -> str:
     return str(vars(actuator).get("_label", ""))
 
 
-def set_display_name(actuator: ActuatorModel, label: str) -> Any:
+def set_display_name(actuator: Named, label: str) -> Named:
     """Set the actuator's display name in place; the shared ideal actuator is left unchanged."""
     # The dataclass is frozen, so the label is written past its `__setattr__`. Callers pass an
     # actuator that nothing else refers to.
@@ -117,7 +123,7 @@ def set_display_name(actuator: ActuatorModel, label: str) -> Any:
     return actuator
 
 
-def is_family(value: Any) -> bool:
+def is_family(value: object) -> TypeGuard[Family]:
     """Return True for an actuator class, which as a setting selects its default fields."""
     return isinstance(value, type) and issubclass(value, ActuatorModel)
 
@@ -128,7 +134,7 @@ def _unshared(actuator: ActuatorModel) -> ActuatorModel:
 
 
 @functools.cache
-def _catalogue() -> dict[str, Any]:
+def _catalogue() -> dict[str, ActuatorModel | GearMotor]:
     from codrl_mj.catalogue import motor_entry, motor_names
 
     return {
@@ -137,7 +143,7 @@ def _catalogue() -> dict[str, Any]:
     }
 
 
-def _without_gear(actuator: Any) -> Any:
+def _without_gear(actuator: ActuatorModel) -> ActuatorModel | GearMotor:
     """Return a drive's motor with gear and arm set to 1; other actuators are unchanged."""
     motor = getattr(actuator, "motor", None)
     return (
@@ -147,7 +153,7 @@ def _without_gear(actuator: Any) -> Any:
     )
 
 
-def named_mapping(actuator: ActuatorModel) -> Any:
+def named_mapping(actuator: ActuatorModel) -> dict[str, FieldValue] | None:
     """Return a short mapping for `resolve`: a catalogue motor's `name` and its changed fields.
 
     Other actuators give their `label` and all fields.
@@ -167,7 +173,7 @@ def named_mapping(actuator: ActuatorModel) -> Any:
     return {"label": name, **mapping} if name else mapping_of(actuator)
 
 
-def resolve(actuator: Any, paper: DCMotorActuator | None, owner: str) -> Any:
+def resolve(actuator: ActuatorSetting, paper: DCMotorActuator | None, owner: str) -> ActuatorModel:
     """Convert any user setting for an actuator to an `ActuatorModel`.
 
     Args:
@@ -223,7 +229,7 @@ def resolve(actuator: Any, paper: DCMotorActuator | None, owner: str) -> Any:
         )
     imported = look_up(
         actuator,
-        NAMED | FAMILIES,
+        {**NAMED, **FAMILIES},
         "actuator",
         suggestions={"the motors of `codrl-mj motor list`": motor_names()},
     )
@@ -236,11 +242,14 @@ def resolve(actuator: Any, paper: DCMotorActuator | None, owner: str) -> Any:
     )
 
 
+# YAML has no schema: whatever a file contains arrives here.
+FileEntry = Any
+"""Entry of an actuator file's `identified` section."""
 _CHANGED = ", changed"
 _FILES = (".yaml", ".yml", ".json")
 
 
-def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
+def _read(path: Path) -> tuple[dict[str, FieldValue], Mapping[str, FileEntry]]:
     """Read an actuator's fields, and the `identified` section that `codrl-mj identify` wrote.
 
     Raises:
@@ -266,7 +275,7 @@ def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
     return fields, section
 
 
-def _from_file(path: Path, paper: DCMotorActuator | None, owner: str) -> Any:
+def _from_file(path: Path, paper: DCMotorActuator | None, owner: str) -> ActuatorModel:
     """Return the actuator in a YAML or JSON file that holds a mapping of its fields."""
     fields, _ = _read(path)
     # Only one level of files is followed, which also excludes files that name each other.
@@ -314,7 +323,7 @@ def identified_ranges(path: Path | str) -> dict[str, str]:
     }
 
 
-def override_actuator(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
+def override_actuator(base: ActuatorModel, changes: Mapping[str, FieldValue]) -> ActuatorModel:
     """Return an actuator with some fields changed.
 
     Args:
@@ -328,7 +337,7 @@ def override_actuator(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
             none; or the family is not related to the actuator's.
     """
     fields_set = {name: value for name, value in changes.items() if value != {}}
-    kind: Any = type(base)
+    kind = type(base)
     family = fields_set.pop("family", family_name(kind))
     family = family_name(family) if is_family(family) else family
     if family == family_name(kind) and not fields_set:
@@ -341,7 +350,7 @@ def override_actuator(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
     if family != family_name(kind):
         kind = _related_family(family, kind)
     _check_fields(fields_set, kind)
-    merged: dict[str, Any] = {
+    merged: dict[str, FieldValue] = {
         key: value for key, value in base.as_mapping().items() if key in _field_names(kind)
     }
     for name, value in fields_set.items():
@@ -349,7 +358,7 @@ def override_actuator(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
         merged[name] = {**(inner or {}), **value} if isinstance(value, Mapping) else value
     actuator = kind.from_mapping(merged)
     if (
-        issubclass(kind, Servo)
+        isinstance(actuator, Servo)
         and not isinstance(base, Servo)
         and isinstance(fields_set.get("loop", {}), Mapping)
     ):
@@ -370,7 +379,7 @@ def override_actuator(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
     )
 
 
-def _related_family(family: str, kind: Any) -> Any:
+def _related_family(family: str, kind: Family) -> Family:
     """Return the family with a name, which must be a subclass or base class of `kind`.
 
     A servo is a drive with outer loops, so a drive's motor, controller and supply become a servo's,
@@ -390,12 +399,12 @@ def _related_family(family: str, kind: Any) -> Any:
     return related
 
 
-def _field_names(kind: Any) -> set[str]:
+def _field_names(kind: Family) -> set[str]:
     """Return the names of a family's fields."""
     return {field.name for field in dataclasses.fields(kind)}
 
 
-def _check_fields(names: Mapping[str, Any], kind: Any) -> None:
+def _check_fields(names: Iterable[str], kind: Family) -> None:
     """Raise if only a related family has one of the fields; the message names that family."""
     for name in names:
         owners = [

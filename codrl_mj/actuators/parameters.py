@@ -4,19 +4,39 @@ import dataclasses
 import functools
 import itertools
 from collections import namedtuple
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, ClassVar, Protocol, Self, TypeVar, cast
 
 from codrl_mj import fields
 
+Owner = TypeVar("Owner")
+"""Class of an object with fields: a family, or a nested part."""
+# A field holds a number, a flag, a word, a nested part or None. The path that is looked up at run
+# time determines which, so a type checker cannot know it.
+FieldValue = Any
+"""Value of a field."""
 
-def family_of(actuator: Any) -> Any:
+
+class Parameters(Protocol):
+    """Parameters of an actuator: a named tuple of floats, whose class `parameters_type` creates."""
+
+    _fields: ClassVar[tuple[str, ...]]
+
+    def __init__(self, *numbers: float) -> None:
+        """Create the named tuple from the numbers in the order of `parameter_paths`."""
+
+    def __getattr__(self, name: str) -> float: ...
+    def __iter__(self) -> Iterator[float]: ...
+    def _replace(self, **changes: float) -> Self: ...
+
+
+def family_of(actuator: object) -> type:
     """Return the family of an actuator; a family is returned as it is."""
     return actuator if isinstance(actuator, type) else type(actuator)
 
 
 @functools.cache
-def _fields(cls: type) -> dict[str, dataclasses.Field[Any]]:
+def _fields(cls: type) -> dict[str, dataclasses.Field[FieldValue]]:
     """Return the fields of a dataclass by name.
 
     The result is cached: an environment with several motors needs it thousands of times.
@@ -24,7 +44,7 @@ def _fields(cls: type) -> dict[str, dataclasses.Field[Any]]:
     return {field.name: field for field in dataclasses.fields(cls)}
 
 
-def value_at(owner: Any, path: str) -> Any:
+def value_at(owner: object, path: str) -> FieldValue:
     """Return the value at a dotted path: a word's index, or the default of a part that is None."""
     for name in path.split("."):
         known, value = _fields(family_of(owner)), getattr(owner, name)
@@ -35,7 +55,7 @@ def value_at(owner: Any, path: str) -> Any:
     return owner
 
 
-def to_field_type(cls: type, name: str, value: Any) -> Any:
+def to_field_type(cls: type, name: str, value: FieldValue) -> FieldValue:
     """Convert a number to the type of a field; arrays hold integers, flags and words as floats."""
     field = _fields(cls)[name]
     default, options = field.default, field.metadata.get("options", ())
@@ -48,37 +68,40 @@ def to_field_type(cls: type, name: str, value: Any) -> Any:
     return value
 
 
-def from_values(cls: type, values: Mapping[str, Any], prefix: str = "") -> Any:
+def from_values(cls: type[Owner], values: Mapping[str, FieldValue], prefix: str = "") -> Owner:
     """Build a dataclass from values by dotted path; nested ones equal to their default are None."""
-    nested, values_by_field = fields.nested_types(cls), {}
-    for field in _fields(cls).values():
+    kind: type = cls
+    nested = fields.nested_types(kind)
+    values_by_field: dict[str, FieldValue] = {}
+    for field in _fields(kind).values():
         if field.name in nested:
-            inner = from_values(nested[field.name], values, f"{prefix}{field.name}.")
+            inner: object = from_values(nested[field.name], values, f"{prefix}{field.name}.")
             values_by_field[field.name] = None if inner == field.metadata.get("absent") else inner
         else:
             values_by_field[field.name] = to_field_type(
-                cls, field.name, values[f"{prefix}{field.name}"]
+                kind, field.name, values[f"{prefix}{field.name}"]
             )
     return cls(**values_by_field)
 
 
-def field_values(actuator: Any) -> tuple[float, ...]:
+def field_values(actuator: object) -> tuple[float, ...]:
     """Return the values of all fields in the order of `field_paths`: words and flags as numbers."""
     return tuple(float(value_at(actuator, path)) for path in field_paths(family_of(actuator)))
 
 
-def from_array(cls: Any, values: Iterable[float]) -> Any:
+def from_array(cls: type[Owner], values: Iterable[float]) -> Owner:
     """Build an actuator from a vector of field values without validation, ten times faster."""
     # `object.__new__` skips `__post_init__`, and writing to `vars` is how a frozen dataclass can be
     # filled without its `__setattr__`.
+    kind: type = cls
     remaining, actuator = iter(values), object.__new__(cls)
-    for name, part in _outline(cls):
+    for name, part in _outline(kind):
         vars(actuator)[name] = next(remaining) if part is None else from_array(part, remaining)
     return actuator
 
 
 @functools.cache
-def _outline(cls: Any) -> tuple[tuple[str, Any], ...]:
+def _outline(cls: type) -> tuple[tuple[str, type | None], ...]:
     """Return the fields of a dataclass, each with the class of a nested part or with None."""
     part_types = fields.nested_types(cls)
     return tuple((field.name, part_types.get(field.name)) for field in _fields(cls).values())
@@ -86,11 +109,10 @@ def _outline(cls: Any) -> tuple[tuple[str, Any], ...]:
 
 def choices_of(cls: type, path: str) -> tuple[str, ...]:
     """Return the words that a field at a dotted path accepts; empty if the field is a number."""
-    owner: Any = cls
-    for name in path.split("."):
-        field = next(field for field in dataclasses.fields(owner) if field.name == name)
-        owner = fields.nested_types(owner).get(name)
-    words: tuple[str, ...] = field.metadata.get("options", ())
+    *parts, last = path.split(".")
+    for part in parts:
+        cls = fields.nested_types(cls)[part]
+    words: tuple[str, ...] = _fields(cls)[last].metadata.get("options", ())
     return words
 
 
@@ -102,7 +124,7 @@ def is_arm(path: str) -> bool:
 @functools.cache
 def field_paths(cls: type) -> tuple[str, ...]:
     """Return the dotted paths of all fields of a family, including nested ones."""
-    inner = (
+    inner: Iterable[list[str]] = (
         [f"{name}.{path}" for path in field_paths(part)] if part else [name]
         for name, part in _outline(cls)
     )
@@ -134,15 +156,13 @@ def parameter_paths(cls: type) -> Mapping[str, str]:
 
 
 @functools.cache
-def parameters_type(cls: type) -> Any:
+def parameters_type(cls: type) -> type[Parameters]:
     """Return the type of the named tuple of parameters that a family's `advance` takes."""
-    # Mypy accepts the field names of a named tuple only as a literal.
-    make: Callable[..., Any] = namedtuple
-    tuple_type = make("Parameters", parameter_paths(cls))
+    tuple_type = namedtuple("Parameters", parameter_paths(cls))  # type: ignore[misc]
     # The type is created at run time, so pickle cannot find it by name.
-    tuple_type.__reduce__ = lambda self: (_parameters, (cls, *self))
-    return tuple_type
+    tuple_type.__reduce__ = lambda self: (_parameters, (cls, *self))  # type: ignore
+    return cast(type[Parameters], tuple_type)
 
 
-def _parameters(cls: type, *numbers: float) -> Any:
+def _parameters(cls: type, *numbers: float) -> Parameters:
     return parameters_type(cls)(*numbers)

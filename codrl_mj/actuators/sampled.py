@@ -21,8 +21,8 @@ i) with m = (1 - e)*L/(R*T). Unsaturated, with E = i_ref - i and l = i - c, v - 
 """
 
 import math
-from typing import Any
 
+from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 
 _DEFAULT_ANGLE = 2.0 * math.pi * DEFAULT_BANDWIDTH
@@ -135,7 +135,7 @@ def samples_until(bound: float, start: float, rate: float, maximum: int) -> int:
 
 
 def run_samples(
-    parameters: Any,
+    parameters: Parameters,
     current: float,
     integral: float,
     pending: float,

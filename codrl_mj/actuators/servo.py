@@ -9,13 +9,14 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import drive, shaft, stability
 from codrl_mj.actuators.drive import ARM_FIELDS, Drive
 from codrl_mj.actuators.model import Command, Inputs
+from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.shaft import Shaft, StepAverages
 from codrl_mj.fields import Checked, choice, real
 
@@ -125,7 +126,7 @@ class Signals(NamedTuple):
 
 
 def torque_demand(
-    parameters: Any,
+    parameters: Parameters,
     period: float,
     target: float,
     rate: float,
@@ -153,7 +154,7 @@ def torque_demand(
 
 
 def advance(
-    parameters: Any, timestep: float, state: State, inputs: Inputs
+    parameters: Parameters, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Signals]:
     """Advance all loops by one mechanical step, and predict the speed at each sample within it.
 
@@ -228,8 +229,8 @@ class Servo(Drive):
     """
 
     family: ClassVar[str] = "servo"
-    State: ClassVar[type] = State
-    Signals: ClassVar[type] = Signals
+    State: ClassVar[type[NamedTuple]] = State
+    Signals: ClassVar[type[NamedTuple]] = Signals
     SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {**Drive.SIGNAL_UNITS, "error": "rad or rad/s"}
     is_torque_controlled: ClassVar[bool] = False
     MOTION: ClassVar[bool] = True
@@ -251,7 +252,7 @@ class Servo(Drive):
         )
         return float(f"{10.0 * slope:.3g}")
 
-    def with_default_gain(self, loop_fields: Mapping[str, Any]) -> "Servo":
+    def with_default_gain(self, loop_fields: Mapping[str, object]) -> "Servo":
         """Return this servo with `default_velocity_gain`, unless `loop_fields` set a velocity gain.
 
         Raises:

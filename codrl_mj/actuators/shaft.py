@@ -6,9 +6,11 @@ previous step. If the inertia is unknown the speed is held.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from codrl_mj.actuators import sampled
+from codrl_mj.actuators.gear_motor import GearMotor
+from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 
 RATED_TEMPERATURE = 25.0
@@ -64,12 +66,12 @@ class StepAverages(NamedTuple):
     """Heat [W] in the winding, from its resistance and the squared current within the samples."""
 
 
-def temperature_of(parameters: Any, heat: TemperatureRises) -> float:
+def temperature_of(parameters: Parameters, heat: TemperatureRises) -> float:
     """Return the temperature [degC] of the winding."""
     return parameters.ambient_temperature + heat.winding + heat.housing
 
 
-def resistance_at(parameters: Any, temperature: float) -> float:
+def resistance_at(parameters: Parameters | GearMotor, temperature: float) -> float:
     """Return the resistance [ohm] of the winding at a temperature [degC]."""
     return parameters.resistance * (
         1.0 + parameters.resistance_coefficient * (temperature - RATED_TEMPERATURE)
@@ -88,7 +90,7 @@ def rise_after(
 
 
 def rises_after(
-    parameters: Any, duration: float, heat: TemperatureRises, watts: float
+    parameters: Parameters, duration: float, heat: TemperatureRises, watts: float
 ) -> TemperatureRises:
     """Return the temperature differences after some time [s] of a constant loss [W] in the winding.
 
@@ -113,7 +115,7 @@ def rises_after(
 
 
 def thermal_limit(
-    parameters: Any, duration: float, heat: TemperatureRises, resistance: float
+    parameters: Parameters, duration: float, heat: TemperatureRises, resistance: float
 ) -> float:
     """Return the current [A] that heats the winding just to `max_temperature` in some time [s].
 
@@ -130,7 +132,7 @@ def thermal_limit(
     return math.sqrt(max(margin, 0.0) / (resistance * (per_watt.winding + per_watt.housing)))
 
 
-def inertia_of(parameters: Any, inertia: float) -> float:
+def inertia_of(parameters: Parameters, inertia: float) -> float:
     """Return the inertia [kg*m^2] that the rotor moves; `inf` if the speed is held.
 
     It follows from `load_inertia` if that is not 0, and otherwise from the model.
@@ -160,7 +162,7 @@ def estimate_external_acceleration(
     return 0.5 * (change / timestep - motor_acceleration) + 0.5 * external_acceleration
 
 
-def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> float:
+def friction(parameters: Parameters, duration: float, torque: float, shaft: Shaft) -> float:
     """Return the torque [N*m] of Stribeck friction and gear losses by an implicit step.
 
     Friction opposes the speed that the shaft would have without it. It is at most the torque that
@@ -186,13 +188,13 @@ def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> f
     return math.copysign(min(level, stopping_torque), free_speed) if free_speed != 0.0 else 0.0
 
 
-def has_thermal_model(parameters: Any) -> bool:
+def has_thermal_model(parameters: Parameters) -> bool:
     """Return True if the motor's temperature can change."""
     return parameters.thermal_resistance_winding + parameters.thermal_resistance_housing > 0.0
 
 
 def advance_winding(
-    parameters: Any,
+    parameters: Parameters,
     resistance: float,
     samples: int,
     winding: Winding,
@@ -280,7 +282,7 @@ def advance_winding(
 
 
 def advance_motor(
-    parameters: Any,
+    parameters: Parameters,
     resistance: float,
     duration: float,
     samples: int,

@@ -3,17 +3,64 @@
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from codrl_mj.actuators.model import Inputs, UnstableError
-from codrl_mj.actuators.parameters import parameters_type
+from codrl_mj.actuators.model import ActuatorModel, Advance, Inputs, UnstableError
+from codrl_mj.actuators.parameters import FieldValue, parameters_type
+
+# The function is written for numbers, and computes with arrays here.
+ElectricalStep = Callable[..., tuple[Any, ...]]
+"""Step of a current loop: see `codrl_mj.actuators.current_loop.electrical_step`."""
 
 
-def parameter_columns(family: Any, parameter_values: np.ndarray) -> Any:
+class Gains(Protocol):
+    """Gains and electrical steps of a current loop, such as `CurrentLoop`."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[FieldValue]]]
+
+    @property
+    def kp(self) -> float:
+        """Proportional gain [V/A]."""
+
+    @property
+    def ki(self) -> float:
+        """Integral gain [V/(A*s)]."""
+
+    @property
+    def kd(self) -> float:
+        """Derivative gain [V*s/A]."""
+
+    @property
+    def substeps(self) -> int:
+        """Electrical steps per mechanical step."""
+
+
+class LoopActuator(Protocol):
+    """Actuator with a current loop that takes electrical steps, such as `DCMotorActuator`."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[FieldValue]]]
+    electrical_step: ClassVar[ElectricalStep]
+
+    @property
+    def controller(self) -> Gains:
+        """The current loop."""
+
+    @property
+    def parameter_values(self) -> tuple[float, ...]:
+        """Parameters, as in `ActuatorModel.parameter_values`."""
+
+
+class ParameterColumns(Protocol):
+    """Parameters of several actuators, each an array with a number for each actuator."""
+
+    def __getattr__(self, name: str) -> np.ndarray: ...
+
+
+def parameter_columns(family: type, parameter_values: np.ndarray) -> ParameterColumns:
     """Return the parameters of m actuators, each as an array (m,), from rows of values (m, p)."""
-    return parameters_type(family)(*parameter_values.T)
+    return cast(ParameterColumns, parameters_type(family)(*parameter_values.T))
 
 
 class _Unlimited:
@@ -30,7 +77,7 @@ class _Unlimited:
 
 
 def _closed_loops(
-    family: Any, parameter_values: np.ndarray, timestep: float
+    family: type[LoopActuator], parameter_values: np.ndarray, timestep: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the transition matrices of an electrical step, and the number of steps.
 
@@ -56,7 +103,9 @@ def _closed_loops(
     return np.where(is_used[:, np.newaxis] & is_used, matrices, 0.0), parameters.substeps
 
 
-def spectral_radii(family: Any, parameter_values: np.ndarray, timestep: float) -> np.ndarray:
+def spectral_radii(
+    family: type[LoopActuator], parameter_values: np.ndarray, timestep: float
+) -> np.ndarray:
     """Return the spectral radii of many actuators; see `spectral_radius`.
 
     Args:
@@ -75,7 +124,8 @@ def spectral_radii(family: Any, parameter_values: np.ndarray, timestep: float) -
         radii = np.abs(values.astype(np.complex128)).max(axis=1)
         radii = np.where(finite, radii, np.inf)
         # The radius is raised to the power, because a power of the matrix could overflow into NaN.
-        return radii**substeps
+        powers: np.ndarray = radii**substeps
+        return powers
 
 
 MARGIN = 1e-9
@@ -84,7 +134,9 @@ the rounding errors of either method.
 """
 
 
-def stability_radii(family: Any, parameter_values: np.ndarray, timestep: float) -> np.ndarray:
+def stability_radii(
+    family: type[LoopActuator], parameter_values: np.ndarray, timestep: float
+) -> np.ndarray:
     """Return 0 for stable loops, infinity for unstable ones, and the spectral radius if in doubt.
 
     Jury's criterion decides all clear cases, which saves nearly all of the eigenvalues.
@@ -114,7 +166,7 @@ def stability_radii(family: Any, parameter_values: np.ndarray, timestep: float) 
     return radii
 
 
-def spectral_radius(actuator: Any, timestep: float) -> float:
+def spectral_radius(actuator: LoopActuator, timestep: float) -> float:
     """Return the largest absolute eigenvalue of the closed loop over one mechanical step.
 
     The loop is stable if it is below 1.
@@ -126,7 +178,7 @@ def spectral_radius(actuator: Any, timestep: float) -> float:
     return float(spectral_radii(type(actuator), np.array([actuator.parameter_values]), timestep)[0])
 
 
-def check_stable(actuator: Any, timestep: float) -> None:
+def check_stable(actuator: LoopActuator, timestep: float) -> None:
     """Raise if an actuator's closed loop is unstable at this step.
 
     Args:
@@ -210,8 +262,8 @@ WITHOUT_FRICTION = {"stribeck_friction": 0.0, "gear_efficiency": 1.0, "deadband"
 
 
 def linearize(
-    actuator: Any,
-    advance: Callable[..., Any],
+    actuator: ActuatorModel,
+    advance: Advance,
     timestep: float,
     inertia: float,
     change: float = PERTURBATION,
@@ -229,7 +281,7 @@ def linearize(
         Shape (steps, s + 1, s + 2): the new states and the torque, for the states, the position and
         the speed.
     """
-    family: Any = type(actuator)
+    family = type(actuator)
     period = actuator.steps_per_sample(timestep)
     parameters = parameters_type(family)(*actuator.parameter_values)
     count = len(family.State._fields)
@@ -241,7 +293,7 @@ def linearize(
     def advanced(point: np.ndarray, time: float) -> np.ndarray:
         *states, position, speed = point.tolist()
         inputs = Inputs(0.0, position, speed, time, 0.0, inertia)
-        after, torque, _ = advance(parameters, timestep, family.State(*states), inputs)
+        after, torque, _ = advance(parameters, timestep, family.State._make(states), inputs)
         return np.array([*after, torque])
 
     # The first period is not recorded: it only makes counters and times periodic.

@@ -7,9 +7,10 @@ loop, only the line through stall torque and no-load speed, and a torque limit.
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 from codrl_mj.actuators.model import ActuatorModel, Empty, Inputs, UnstableError
+from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.fields import real
 
 
@@ -22,7 +23,7 @@ class Signals(NamedTuple):
 
 
 def advance(
-    parameters: Any,
+    parameters: Parameters,
     timestep: float,  # noqa: ARG001
     state: Empty,  # noqa: ARG001
     inputs: Inputs,
@@ -52,7 +53,7 @@ class TorqueSpeed(ActuatorModel):
     """
 
     family: ClassVar[str] = "torque_speed"
-    Signals: ClassVar[type] = Signals
+    Signals: ClassVar[type[NamedTuple]] = Signals
     SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {"lower_limit": "N*m", "upper_limit": "N*m"}
     advance: ClassVar = staticmethod(advance)
 

@@ -1,12 +1,13 @@
 """Agents: learning algorithms with their settings."""
 
 from collections.abc import Mapping
-from typing import Any
 
 from codrl_mj.agents.base import AgentConfig, DeepAgentConfig
 from codrl_mj.agents.off_policy import DDPGConfig, DQNConfig, SACConfig, TD3Config
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.sarsa import SARSAConfig
+from codrl_mj.boundary import Json
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.user_code import look_up
 
 AGENTS: dict[str, type[AgentConfig]] = {
@@ -44,7 +45,7 @@ def find_agent(name: str) -> type[AgentConfig]:
     return agent
 
 
-def agent_from_mapping(mapping: Mapping[str, Any]) -> AgentConfig:
+def agent_from_mapping(mapping: Mapping[str, Json]) -> AgentConfig:
     """Return an agent's settings from the result of `AgentConfig.as_mapping`.
 
     Raises:
@@ -54,18 +55,16 @@ def agent_from_mapping(mapping: Mapping[str, Any]) -> AgentConfig:
     return find_agent(str(settings.pop("name", None))).from_mapping(settings)
 
 
-def check_fits(agent: str, env: Any) -> None:
+def check_fits(agent: str, env: EnvConfig) -> None:
     """Raise an error if an agent cannot act in an environment's action space.
 
     Args:
         agent: the agent's name.
-        env: the environment's `EnvConfig`.
+        env: settings of the environment.
 
     Raises:
         ValueError: it cannot; the message names the agents that can.
     """
-    # `env` is not annotated: the import of its module would take long for callers that only need
-    # settings.
     space = env.action_space
     if not isinstance(space, find_agent(agent).action_spaces):
         fitting = [

@@ -1,12 +1,70 @@
 """Base classes of the agents' settings."""
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Protocol
 
+import numpy as np
 from gymnasium import spaces
 
+from codrl_mj.boundary import Json, JsonObject
 from codrl_mj.fields import Checked, check_memory, check_names, positive_reals
+
+# Spaces of one agent have elements of different types, and torch takes seconds to import, which is
+# too long for callers that only need settings: hence two aliases.
+Space = spaces.Space[Any]
+"""Observation or action space; its elements may be of any type."""
+Tensor = Any
+"""A `torch.Tensor`."""
+
+
+class TrainingEnvs(Protocol):
+    """Environments of a training; Stable-Baselines3's `VecEnv` follows the protocol."""
+
+    num_envs: int
+    """Number of environments."""
+    observation_space: Space
+    """Observation space of each environment."""
+    action_space: Space
+    """Action space of each environment."""
+
+
+class AgentPolicy(Protocol):
+    """Policy of an agent; Stable-Baselines3's `BasePolicy` follows the protocol."""
+
+    observation_space: Space
+    """Observation space of the training."""
+    action_space: Space
+    """Action space of the training."""
+
+    def predict(
+        self, observation: np.ndarray, *, deterministic: bool = False
+    ) -> tuple[np.ndarray, object]:
+        """Return actions (N, ...) for observations (N, k), and a state, which callers ignore."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the weights by name."""
+
+    def load_state_dict(self, state_dict: Mapping[str, Tensor]) -> object:
+        """Replace the weights."""
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Set modules to training or to evaluation."""
+
+
+class AgentModel(Protocol):
+    """An agent that learns; Stable-Baselines3's `BaseAlgorithm` follows the protocol."""
+
+    policy: AgentPolicy
+    """The agent's policy, which changes while the agent learns."""
+
+    def set_logger(self, logger: object) -> None:
+        """Replace the logger, a Stable-Baselines3 `Logger`."""
+
+    def learn(
+        self, total_timesteps: int, callback: object = None, log_interval: int | None = None
+    ) -> object:
+        """Learn for a number of environment steps; callbacks are those of Stable-Baselines3."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,7 +77,7 @@ class AgentConfig(Checked):
 
     name: ClassVar[str]
     """Name on the command line, such as `ppo`."""
-    action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]]
+    action_spaces: ClassVar[tuple[type[Space], ...]]
     """Classes of action spaces in which the agent can act."""
 
     def __post_init__(self) -> None:
@@ -30,7 +88,7 @@ class AgentConfig(Checked):
                 object.__setattr__(self, field.name, tuple(value))
         super().__post_init__()
 
-    def make_model(self, env: Any, seed: int) -> Any:
+    def make_model(self, env: TrainingEnvs, seed: int) -> AgentModel:
         """Create the agent.
 
         Args:
@@ -45,7 +103,7 @@ class AgentConfig(Checked):
         """
         raise NotImplementedError
 
-    def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
+    def make_policy(self, observation_space: spaces.Box, action_space: Space) -> AgentPolicy:
         """Create a policy with initial weights, into which saved weights can be loaded.
 
         Returns:
@@ -54,7 +112,7 @@ class AgentConfig(Checked):
         """
         raise NotImplementedError
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> JsonObject:
         """Return the settings as JSON-serializable values, with `registry_name` as `name`."""
         return {"name": self.registry_name(), **dataclasses.asdict(self)}
 
@@ -65,7 +123,7 @@ class AgentConfig(Checked):
         return cls.name if is_built_in else f"{cls.__module__}:{cls.__qualname__}"
 
     @classmethod
-    def from_mapping(cls, mapping: Mapping[str, Any]) -> "AgentConfig":
+    def from_mapping(cls, mapping: Mapping[str, Json]) -> "AgentConfig":
         """Return settings from the result of `as_mapping` without `name`.
 
         Missing fields have their defaults.
@@ -77,7 +135,7 @@ class AgentConfig(Checked):
         return cls(**mapping)
 
 
-def check_buffer(name: str, steps: int, env: Any, observations: int) -> None:
+def check_buffer(name: str, steps: int, env: TrainingEnvs, observations: int) -> None:
     """Raise an error if a buffer does not fit into memory.
 
     Args:
@@ -102,18 +160,18 @@ class DeepAgentConfig(AgentConfig):
     for a network to notice.
     """
 
-    def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
+    def make_policy(self, observation_space: spaces.Box, action_space: Space) -> AgentPolicy:
         """See `AgentConfig.make_policy`."""
         # A policy for evaluation needs no optimizer. Constructing the first one makes torch import
         # a compiler, which takes almost two seconds.
         arguments = {**self._policy_arguments(), "optimizer_class": lambda *_, **__: None}
         return self._policy_class()(observation_space, action_space, lambda _: 0.0, **arguments)
 
-    def _policy_class(self) -> Any:
+    def _policy_class(self) -> Callable[..., AgentPolicy]:
         """Return the class of the agent's policy."""
         raise NotImplementedError
 
-    def _policy_arguments(self) -> dict[str, Any]:
+    def _policy_arguments(self) -> dict[str, object]:
         """Return keyword arguments of the policy's class, without spaces and learning rate."""
         if self.input_scale is None:
             return {}

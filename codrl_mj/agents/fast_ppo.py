@@ -6,14 +6,17 @@ algorithm. The module imports torch, so import it only where an agent is created
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import explained_variance
+from stable_baselines3.common.vec_env import VecEnv
 
 from codrl_mj.agents.stacked_networks import StackedNetworks, VectorAdam
 
@@ -135,7 +138,7 @@ class Gaussian:
         return ActionEvaluation(log_prob, entropy, backward)
 
 
-class FastPPO(PPO):
+class FastPPO(PPO):  # mypy does not read the base
     """Faster implementation of Stable-Baselines3's PPO.
 
     The policy, rollouts, losses and minibatches are the same. Only the order of floating-point
@@ -149,8 +152,8 @@ class FastPPO(PPO):
             Stable-Baselines3's `PPO` for these.
     """
 
-    _last_obs: Any
-    _last_episode_starts: Any
+    _last_obs: np.ndarray
+    _last_episode_starts: np.ndarray
 
     def _setup_model(self) -> None:
         if isinstance(self.observation_space, spaces.Dict):
@@ -183,9 +186,13 @@ class FastPPO(PPO):
         # `_setup_model` creates them again from the loaded policy.
         return [*super()._excluded_save_params(), "_networks", "_exploration"]
 
-    @torch.no_grad()
+    @torch.no_grad()  # type: ignore[untyped-decorator] # mypy does not read torch
     def collect_rollouts(
-        self, env: Any, callback: Any, rollout_buffer: Any, n_rollout_steps: int
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
     ) -> bool:
         """Fill the buffer as `PPO.collect_rollouts` does."""
         callback.on_rollout_start()
@@ -240,7 +247,7 @@ class FastPPO(PPO):
         callback.on_rollout_end()
         return True
 
-    @torch.no_grad()
+    @torch.no_grad()  # type: ignore[untyped-decorator] # mypy does not read torch
     def train(self) -> None:
         """Learn from the rollout."""
         if not self._networks.holds(self.policy):

@@ -4,21 +4,27 @@ The module imports torch, so import it only where an agent is created.
 """
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3 import DDPG, DQN, PPO, SAC, TD3
+from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy, ContinuousCritic
-from stable_baselines3.common.torch_layers import FlattenExtractor, create_mlp
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    FlattenExtractor,
+    create_mlp,
+)
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 from torch.nn import functional
 
 
-class ScaledObservation(FlattenExtractor):
+class ScaledObservation(FlattenExtractor):  # mypy does not read the base
     """Features extractor that multiplies an observation's entries by fixed factors.
 
     Entries without a factor are not scaled.
@@ -41,13 +47,13 @@ class ScaledObservation(FlattenExtractor):
         return super().forward(observations) * self.factors
 
 
-class UnitActionPolicy(ActorCriticPolicy):
+class UnitActionPolicy(ActorCriticPolicy):  # mypy does not read the base
     """Policy whose actor has its mean and noise in units of the largest action.
 
     For example, the largest torque of 0.08 N*m or the largest voltage of 18 V is 1.
     """
 
-    def _build(self, lr_schedule: Any) -> None:
+    def _build(self, lr_schedule: Schedule) -> None:
         if not isinstance(self.action_space, spaces.Box):
             raise ValueError(
                 "unit_actions = True: must be False for discrete actions, which"
@@ -57,12 +63,12 @@ class UnitActionPolicy(ActorCriticPolicy):
         largest = np.maximum(np.abs(self.action_space.low), np.abs(self.action_space.high))
         self.register_buffer("largest", torch.as_tensor(largest), persistent=False)
 
-    def _get_action_dist_from_latent(self, latent_pi: torch.Tensor) -> Any:
+    def _get_action_dist_from_latent(self, latent_pi: torch.Tensor) -> Distribution:
         mean = self.action_net(latent_pi) * self.largest
         return self.action_dist.proba_distribution(mean, self.log_std + self.largest.log())
 
 
-class TwoStreams(nn.Module):
+class TwoStreams(nn.Module):  # mypy does not read the base
     """Network for Q(state, action) with separate layers for state and action, then joint layers."""
 
     def __init__(
@@ -96,22 +102,24 @@ class TwoStreams(nn.Module):
         return self.joint(torch.cat([self.state_stream(state), self.action_stream(action)], dim=1))
 
 
-class TwoStreamPolicy(TD3Policy):
+class TwoStreamPolicy(TD3Policy):  # mypy does not read the base
     """Actor and critic of DDPG, with `TwoStreams` as networks of the critic."""
 
     def __init__(
         self,
-        *args: Any,
+        *args: object,
         state_units: Sequence[int],
         action_units: Sequence[int],
         joint_units: Sequence[int],
-        **kwargs: Any,
+        **kwargs: object,
     ) -> None:
         """Take the arguments of `TD3Policy`, and the units of `TwoStreams`."""
         self._streams = state_units, action_units, joint_units
         super().__init__(*args, **kwargs)
 
-    def make_critic(self, features_extractor: Any = None) -> ContinuousCritic:
+    def make_critic(
+        self, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> ContinuousCritic:
         """Create the critic of `TD3Policy`, with `TwoStreams` as its networks."""
         critic = super().make_critic(features_extractor)
         state_size, (action_size,) = critic.features_extractor.features_dim, self.action_space.shape
@@ -121,7 +129,7 @@ class TwoStreamPolicy(TD3Policy):
         return critic
 
 
-class TwoRatePPO(PPO):
+class TwoRatePPO(PPO):  # mypy does not read the base
     """Stable-Baselines3's PPO with separate passes and learning rates for actor and critic.
 
     This is the update of Spinning Up and of Keras's example: passes over the rollout improve the
@@ -132,7 +140,7 @@ class TwoRatePPO(PPO):
     """
 
     def __init__(
-        self, *args: Any, critic_learning_rate: float, critic_epochs: int, **kwargs: Any
+        self, *args: object, critic_learning_rate: float, critic_epochs: int, **kwargs: object
     ) -> None:
         """Take the arguments of `PPO`, and two for the critic.
 
@@ -220,7 +228,7 @@ class TwoRatePPO(PPO):
 class _CriticLearningRate:
     """Mixin for off-policy algorithms whose critic has a separate learning rate."""
 
-    def __init__(self, *args: Any, critic_learning_rate: float, **kwargs: Any) -> None:
+    def __init__(self, *args: object, critic_learning_rate: float, **kwargs: object) -> None:
         """Take the arguments of the Stable-Baselines3 model, and the critic's learning rate.
 
         `learning_rate` is that of all other networks.
@@ -228,29 +236,31 @@ class _CriticLearningRate:
         self.critic_learning_rate = critic_learning_rate
         super().__init__(*args, **kwargs)
 
-    def _update_learning_rate(self, optimizers: Any) -> None:
+    def _update_learning_rate(
+        self, optimizers: list[torch.optim.Optimizer] | torch.optim.Optimizer
+    ) -> None:
         super()._update_learning_rate(optimizers)  # type: ignore[misc]
         update_learning_rate(self.critic.optimizer, self.critic_learning_rate)  # type: ignore[attr-defined]
 
 
-class TwoRateDDPG(_CriticLearningRate, DDPG):
+class TwoRateDDPG(_CriticLearningRate, DDPG):  # mypy does not read the base
     """DDPG with a separate learning rate of the critic, and with `TwoStreams` as its network."""
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TwoStreamPolicy}
 
 
-class TwoRateTD3(_CriticLearningRate, TD3):
+class TwoRateTD3(_CriticLearningRate, TD3):  # mypy does not read the base
     """TD3 with a separate learning rate of the critics."""
 
 
-class TwoRateSAC(_CriticLearningRate, SAC):
+class TwoRateSAC(_CriticLearningRate, SAC):  # mypy does not read the base
     """SAC with a separate learning rate of the critics."""
 
 
-class EpisodicDQN(DQN):
+class EpisodicDQN(DQN):  # mypy does not read the base
     """DQN whose exploration rate is multiplied by a factor, unless None, after every episode."""
 
-    def __init__(self, *args: Any, exploration_decay: float | None, **kwargs: Any) -> None:
+    def __init__(self, *args: object, exploration_decay: float | None, **kwargs: object) -> None:
         """Take the arguments of `DQN`, and the factor.
 
         With a factor, `exploration_fraction` has no effect.
@@ -262,11 +272,14 @@ class EpisodicDQN(DQN):
         super()._setup_model()
         if (decay := self.exploration_decay) is not None:
             initial, final = self.exploration_initial_eps, self.exploration_final_eps
-            self.exploration_schedule = lambda _: max(final, initial * decay**self._episode_num)
+            self.exploration_schedule: Schedule = lambda _: max(
+                final, initial * decay**self._episode_num
+            )
 
-    def _sample_action(self, *args: Any, **kwargs: Any) -> Any:
+    def _sample_action(self, *args: object, **kwargs: object) -> tuple[np.ndarray, np.ndarray]:
         # DQN updates epsilon before it counts an episode as ended, so that the next episode would
         # begin with the epsilon of the last one.
         if self.exploration_decay is not None:
             self.exploration_rate = self.exploration_schedule(self._current_progress_remaining)
-        return super()._sample_action(*args, **kwargs)
+        actions: tuple[np.ndarray, np.ndarray] = super()._sample_action(*args, **kwargs)
+        return actions

@@ -1,11 +1,19 @@
 """Agents that learn from a replay buffer, based on Stable-Baselines3: DDPG, TD3, SAC and DQN."""
 
 import dataclasses
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.agents.base import DeepAgentConfig, check_buffer
+from codrl_mj.agents.base import (
+    AgentModel,
+    AgentPolicy,
+    DeepAgentConfig,
+    Space,
+    TrainingEnvs,
+    check_buffer,
+)
 from codrl_mj.fields import flag, integer, positive_integers, real
 
 
@@ -37,7 +45,7 @@ class OffPolicyConfig(DeepAgentConfig):
     training.
     """
 
-    def make_model(self, env: Any, seed: int) -> Any:
+    def make_model(self, env: TrainingEnvs, seed: int) -> AgentModel:
         """See `AgentConfig.make_model`."""
         if self.train_every is None and env.num_envs > 1:
             raise ValueError(
@@ -47,7 +55,7 @@ class OffPolicyConfig(DeepAgentConfig):
         check_buffer(f"{type(self).__name__}.buffer_size", self.buffer_size, env, observations=2)
         from codrl_mj.agents import models
 
-        return getattr(models, self.algorithm)(
+        model: AgentModel = getattr(models, self.algorithm)(
             "MlpPolicy",
             env,
             learning_rate=self.learning_rate,
@@ -63,17 +71,21 @@ class OffPolicyConfig(DeepAgentConfig):
             device="cpu",
             **self._algorithm_arguments(env.action_space),
         )
+        return model
 
-    def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
+    def _algorithm_arguments(self, action_space: Space) -> dict[str, object]:
         """Return keyword arguments that are specific to the algorithm."""
         raise NotImplementedError
 
-    def _policy_class(self) -> Any:
+    def _policy_class(self) -> Callable[..., AgentPolicy]:
         from codrl_mj.agents import models
 
-        return getattr(models, self.algorithm).policy_aliases["MlpPolicy"]
+        policy_class: Callable[..., AgentPolicy] = getattr(models, self.algorithm).policy_aliases[
+            "MlpPolicy"
+        ]
+        return policy_class
 
-    def _policy_arguments(self) -> dict[str, Any]:
+    def _policy_arguments(self) -> dict[str, object]:
         # A fused Adam updates all tensors of a network in one call, which gives about 10 % more
         # steps per second.
         return {"optimizer_kwargs": {"fused": True}, **super()._policy_arguments()}
@@ -88,7 +100,7 @@ class ActorCriticConfig(OffPolicyConfig):
     noise is independent, with standard deviation sigma.
     """
 
-    action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box,)
+    action_spaces: ClassVar[tuple[type[Space], ...]] = (spaces.Box,)
 
     critic_learning_rate: float | None = real(None, above=0, maximum=1)
     """Adam's step size for the critic, in (0, 1]; None: `learning_rate`."""
@@ -108,11 +120,12 @@ class ActorCriticConfig(OffPolicyConfig):
                 f" must be < 2, and noise_dt = {self.noise_dt!r}"
             )
 
-    def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
+    def _algorithm_arguments(self, action_space: Space) -> dict[str, object]:
         import numpy as np
         from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 
-        mean, sigma = np.zeros(action_space.shape), np.full(action_space.shape, self.noise_sigma)
+        shape = action_space.shape or ()
+        mean, sigma = np.zeros(shape), np.full(shape, self.noise_sigma)
         noise = OrnsteinUhlenbeckActionNoise(mean, sigma, theta=self.noise_theta, dt=self.noise_dt)
         return {
             "critic_learning_rate": self.critic_learning_rate or self.learning_rate,
@@ -148,7 +161,7 @@ class DDPGConfig(ActorCriticConfig):
     256-256 (pendulum), 64 (car).
     """
 
-    def _policy_arguments(self) -> dict[str, Any]:
+    def _policy_arguments(self) -> dict[str, object]:
         streams = {
             name: getattr(self, name) for name in ("state_units", "action_units", "joint_units")
         }
@@ -178,7 +191,7 @@ class TD3Config(ActorCriticConfig):
     range; clipped at 2.5 times that.
     """
 
-    def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
+    def _algorithm_arguments(self, action_space: Space) -> dict[str, object]:
         return {
             "policy_delay": self.policy_delay,
             "target_policy_noise": self.target_noise,
@@ -186,7 +199,7 @@ class TD3Config(ActorCriticConfig):
             **super()._algorithm_arguments(action_space),
         }
 
-    def _policy_arguments(self) -> dict[str, Any]:
+    def _policy_arguments(self) -> dict[str, object]:
         return {"net_arch": list(self.hidden), **super()._policy_arguments()}
 
 
@@ -208,14 +221,14 @@ class SACConfig(ActorCriticConfig):
     log_std_init: float = real(-3.0)
     """Natural logarithm of the initial standard deviation of the state-dependent noise."""
 
-    def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
+    def _algorithm_arguments(self, action_space: Space) -> dict[str, object]:
         return {
             "ent_coef": "auto" if self.entropy_coefficient is None else self.entropy_coefficient,
             "use_sde": self.state_dependent_noise,
             **super()._algorithm_arguments(action_space),
         }
 
-    def _policy_arguments(self) -> dict[str, Any]:
+    def _policy_arguments(self) -> dict[str, object]:
         return {
             "net_arch": list(self.hidden),
             "use_sde": self.state_dependent_noise,
@@ -233,7 +246,7 @@ class DQNConfig(OffPolicyConfig):
 
     name: ClassVar[str] = "dqn"
     algorithm: ClassVar[str] = "EpisodicDQN"
-    action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Discrete,)
+    action_spaces: ClassVar[tuple[type[Space], ...]] = (spaces.Discrete,)
 
     hidden: tuple[int, ...] = positive_integers((64, 128))
     """Units of the hidden layers (ReLU). The paper: 64-128."""
@@ -250,7 +263,7 @@ class DQNConfig(OffPolicyConfig):
     exploration_fraction: float = real(0.2, above=0, maximum=1)
     """Share of all steps, in (0, 1], over which epsilon falls if `exploration_decay` is None."""
 
-    def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
+    def _algorithm_arguments(self, action_space: Space) -> dict[str, object]:
         del action_space
         return {
             "target_update_interval": self.target_every,
@@ -260,5 +273,5 @@ class DQNConfig(OffPolicyConfig):
             "exploration_decay": self.exploration_decay,
         }
 
-    def _policy_arguments(self) -> dict[str, Any]:
+    def _policy_arguments(self) -> dict[str, object]:
         return {"net_arch": list(self.hidden), **super()._policy_arguments()}

@@ -1,11 +1,19 @@
 """PPO: proximal policy optimization with clipping, based on Stable-Baselines3."""
 
 import dataclasses
-from typing import Any, ClassVar, Literal
+from collections.abc import Callable
+from typing import ClassVar, Literal
 
 from gymnasium import spaces
 
-from codrl_mj.agents.base import DeepAgentConfig, check_buffer
+from codrl_mj.agents.base import (
+    AgentModel,
+    AgentPolicy,
+    DeepAgentConfig,
+    Space,
+    TrainingEnvs,
+    check_buffer,
+)
 from codrl_mj.fields import choice, flag, integer, positive_integers, real
 
 
@@ -19,7 +27,7 @@ class PPOConfig(DeepAgentConfig):
     """
 
     name: ClassVar[str] = "ppo"
-    action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box, spaces.Discrete)
+    action_spaces: ClassVar[tuple[type[Space], ...]] = (spaces.Box, spaces.Discrete)
 
     learning_rate: float = real(1e-3, above=0, maximum=1)
     """Adam's step size for the actor, in (0, 1], and for the critic if `critic_learning_rate` is
@@ -79,7 +87,7 @@ class PPOConfig(DeepAgentConfig):
                 " another scale; set one of them"
             )
 
-    def make_model(self, env: Any, seed: int) -> Any:
+    def make_model(self, env: TrainingEnvs, seed: int) -> AgentModel:
         """See `AgentConfig.make_model`.
 
         Raises:
@@ -98,7 +106,7 @@ class PPOConfig(DeepAgentConfig):
                     f" = {size}"
                 )
         check_buffer("PPOConfig.rollout_steps", self.rollout_steps, env, observations=1)
-        arguments: dict[str, Any] = {
+        arguments: dict[str, object] = {
             "learning_rate": self.learning_rate,
             "n_steps": self.rollout_steps // env.num_envs,
             "batch_size": batch_size,
@@ -118,7 +126,8 @@ class PPOConfig(DeepAgentConfig):
             algorithm = (
                 FastPPO if isinstance(env.action_space, spaces.Box | spaces.Discrete) else PPO
             )
-            return algorithm(self._policy_class(), env, **arguments)
+            model: AgentModel = algorithm(self._policy_class(), env, **arguments)
+            return model
         return TwoRatePPO(
             self._policy_class(),
             env,
@@ -127,17 +136,20 @@ class PPOConfig(DeepAgentConfig):
             **arguments,
         )
 
-    def _policy_class(self) -> Any:
+    def _policy_class(self) -> Callable[..., AgentPolicy]:
         from stable_baselines3.common.policies import ActorCriticPolicy
 
         from codrl_mj.agents.models import UnitActionPolicy
 
-        return UnitActionPolicy if self.unit_actions else ActorCriticPolicy
+        policy_class: Callable[..., AgentPolicy] = (
+            UnitActionPolicy if self.unit_actions else ActorCriticPolicy
+        )
+        return policy_class
 
-    def _policy_arguments(self) -> dict[str, Any]:
+    def _policy_arguments(self) -> dict[str, object]:
         return {"use_sde": self.state_dependent_noise, **self._network()}
 
-    def _network(self) -> dict[str, Any]:
+    def _network(self) -> dict[str, object]:
         from torch import nn
 
         return {

@@ -1,11 +1,11 @@
 """SARSA: episodic semi-gradient SARSA with tile coding."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.agents.base import AgentConfig
+from codrl_mj.agents.base import AgentConfig, AgentModel, AgentPolicy, Space, TrainingEnvs
 from codrl_mj.fields import integer, positive_integers, real, reals
 
 
@@ -20,7 +20,7 @@ class SARSAConfig(AgentConfig):
     """
 
     name: ClassVar[str] = "sarsa"
-    action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Discrete,)
+    action_spaces: ClassVar[tuple[type[Space], ...]] = (spaces.Discrete,)
 
     step_size: float = real(0.0375, above=0)
     """Step size alpha of each weight, > 0; 1/tilings would set an estimate to its target in one
@@ -51,7 +51,7 @@ class SARSAConfig(AgentConfig):
     The paper: 0, with rewards of -1.
     """
 
-    def make_model(self, env: Any, seed: int) -> Any:
+    def make_model(self, env: TrainingEnvs, seed: int) -> AgentModel:
         """See `AgentConfig.make_model`.
 
         Raises:
@@ -62,7 +62,7 @@ class SARSAConfig(AgentConfig):
 
         return SARSA(TileCodingPolicy, env, self, seed=seed)
 
-    def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
+    def make_policy(self, observation_space: spaces.Box, action_space: Space) -> AgentPolicy:
         """See `AgentConfig.make_policy`."""
         from codrl_mj.agents.sarsa_algorithm import TileCodingPolicy
 

@@ -6,8 +6,8 @@ section 12.7.
 
 import sys
 import time
-from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple, TypeGuard, cast
 
 import numpy as np
 import torch
@@ -15,8 +15,10 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 
+from codrl_mj.agents.base import Space
 from codrl_mj.agents.tile_coding import (
     TileCoder,
     action_value,
@@ -25,12 +27,18 @@ from codrl_mj.agents.tile_coding import (
     find_tiles,
     make_coder,
 )
+from codrl_mj.boundary import Info
 from codrl_mj.compile_cache import njit
 from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.envs.compiled import bind_observation, compiled_kernels
 from codrl_mj.envs.sb3 import ActuatedVecEnv
+from codrl_mj.physics import MujocoPhysics, Signals
 from codrl_mj.physics.streams import generator_words, set_generator_words
 
+# The module of `SARSAConfig` imports this one where it creates an agent, so its class cannot be
+# imported here.
+Settings = Any
+"""A `SARSAConfig`; None in a saved model, until its own is loaded."""
 MIN_ELIGIBILITY = 1e-3
 """Eligibility below which a trace is removed."""
 
@@ -154,7 +162,7 @@ def _update_traces(
 def run_episode(
     learner: Learner,
     generator: np.random.Generator,
-    step: Any,
+    step: Callable[[float, int], tuple[float, bool, bool]],
     forces: np.ndarray,
     observation: np.ndarray,
     record: np.ndarray,
@@ -194,7 +202,7 @@ def run_episode(
     return total, length, terminated, True
 
 
-class TileCodingPolicy(BasePolicy):
+class TileCodingPolicy(BasePolicy):  # mypy does not read the base
     """Greedy or epsilon-greedy policy by action values that are linear in the active tiles.
 
     With `deterministic=True` the first of equally good actions is chosen. `predict(...,
@@ -202,9 +210,7 @@ class TileCodingPolicy(BasePolicy):
     the algorithm, so that evaluations do not change it.
     """
 
-    def __init__(
-        self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], config: Any
-    ) -> None:
+    def __init__(self, observation_space: Space, action_space: Space, config: Settings) -> None:
         """Create a policy with initial weights."""
         if not isinstance(action_space, spaces.Discrete) or action_space.start != 0:
             raise ValueError(
@@ -236,9 +242,10 @@ class TileCodingPolicy(BasePolicy):
     @property
     def table(self) -> np.ndarray:
         """Weights of the policy as a writable array, shape (tiles, actions), float64."""
-        return self.weights.numpy()
+        table: np.ndarray = self.weights.numpy()
+        return table
 
-    def _predict(self, observation: Any, deterministic: bool = False) -> torch.Tensor:
+    def _predict(self, observation: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         epsilon, generator = self.config.epsilon, self.generator
         return torch.from_numpy(
             choose_actions(
@@ -246,12 +253,29 @@ class TileCodingPolicy(BasePolicy):
             )
         )
 
-    def _get_constructor_parameters(self) -> dict[str, Any]:
+    def _get_constructor_parameters(self) -> dict[str, object]:
         return {
             "observation_space": self.observation_space,
             "action_space": self.action_space,
             "config": self.config,
         }
+
+
+class LearnedSteps(NamedTuple):
+    """Steps of one environment from which an agent has learned."""
+
+    steps: int
+    """Number of steps."""
+    new_obs: np.ndarray
+    """Observation after them, shape (1, k); after an episode the first one of the next."""
+    rewards: np.ndarray
+    """Sum of their rewards, shape (1,)."""
+    dones: np.ndarray
+    """True if an episode ended, shape (1,)."""
+    infos: list[Info]
+    """Info of the last step."""
+    signals: Signals | None
+    """Actuator's signals in the steps, each of shape (steps,); None if they are unknown."""
 
 
 class CompiledEpisodes:
@@ -265,15 +289,19 @@ class CompiledEpisodes:
     def __init__(self, env: ActuatedVecEnv) -> None:
         """Create the simulation of an environment for which `can_run` is True."""
         self.env = env
-        vector: Any = env.env
-        self._physics: Any = vector.setup.simulate()
+        vector = cast(ActuatedVectorEnv, env.env)
+        self._physics = cast(MujocoPhysics, vector.setup.simulate())
         self._step = compiled_kernels(vector.setup, self._physics).step
         self._pointers, self._observation = bind_observation(vector.setup, self._physics)
-        self._forces = vector.setup.commands.action_forces
-        self._record = np.empty((vector.max_episode_steps, self._physics.trace.shape[2]))
+        # SARSA has discrete actions, and `can_run` requires a time limit.
+        forces, limit = vector.setup.commands.action_forces, vector.max_episode_steps
+        assert forces is not None
+        assert limit is not None
+        self._forces = forces
+        self._record = np.empty((limit, self._physics.trace.shape[2]))
 
     @staticmethod
-    def can_run(env: Any) -> bool:
+    def can_run(env: object) -> TypeGuard[ActuatedVecEnv]:
         """Return True if whole episodes of an environment can run in compiled code.
 
         It must be a single `ActuatedVectorEnv` with one motor and a time limit, and without
@@ -289,15 +317,13 @@ class CompiledEpisodes:
             and env.env.max_episode_steps is not None
         )
 
-    def run(self, learner: Learner, generator: np.random.Generator) -> tuple[Any, ...] | None:
+    def run(self, learner: Learner, generator: np.random.Generator) -> LearnedSteps | None:
         """Learn from an episode; return None, without effect, if one has already started.
 
         Returns:
-            The arguments of `SARSA._count`: number of steps, first observation (1, k) of the next
-            episode, sum of the rewards (1,), True (1,) because the episode ended, infos of the last
-            step, and the actuator's signals, each of shape (steps,).
+            The episode's steps, whose only reward is the sum of the rewards.
         """
-        vector: Any = self.env.env
+        vector = cast(ActuatedVectorEnv, self.env.env)
         setup, snapshot = vector.setup, vector.snapshot()
         if snapshot["elapsed"][0] != 0:
             return None
@@ -314,11 +340,11 @@ class CompiledEpisodes:
         if not is_finite:
             self._physics.check_finite()
         columns = self._record[:length].T.copy()
-        signals = setup.signals(columns, columns[0])
+        signals = vector.bank.signals(columns, columns[0])
         observations, infos = self.env.finish_episode(
             self._observation.copy(), total, length, not terminated, signals
         )
-        return (
+        return LearnedSteps(
             length,
             observations,
             np.array([total], dtype=np.float32),
@@ -328,7 +354,7 @@ class CompiledEpisodes:
         )
 
 
-class SARSA(BaseAlgorithm):
+class SARSA(BaseAlgorithm):  # mypy does not read the base
     """Episodic semi-gradient SARSA (Sutton and Barto, 2018, section 10.1) or SARSA(lambda).
 
     `trace_decay` selects SARSA(lambda). A rollout is an episode: `on_rollout_start` and
@@ -345,10 +371,14 @@ class SARSA(BaseAlgorithm):
     policy: TileCodingPolicy
     compiled = True
     """Run whole episodes in compiled code if the environment allows it; results are the same."""
-    _last_obs: Any
+    _last_obs: np.ndarray
 
     def __init__(
-        self, policy: str | type[TileCodingPolicy], env: Any, config: Any = None, **settings: Any
+        self,
+        policy: str | type[TileCodingPolicy],
+        env: GymEnv | str | None,
+        config: Settings = None,
+        **settings: object,
     ) -> None:
         """Take the arguments of `BaseAlgorithm`, for one environment, and a `SARSAConfig`.
 
@@ -358,10 +388,8 @@ class SARSA(BaseAlgorithm):
         self._episodes: CompiledEpisodes | None = None
         # The probability of a random action in the current episode.
         self.exploration_rate = getattr(config, "epsilon", 0.0)
-        if getattr(env, "num_envs", 1) != 1:
-            raise ValueError(
-                f"num_envs = {env.num_envs}: SARSA learns from one environment: must be 1"
-            )
+        if (num_envs := getattr(env, "num_envs", 1)) != 1:
+            raise ValueError(f"num_envs = {num_envs}: SARSA learns from one environment: must be 1")
         should_set_up = settings.pop("_init_setup_model", True)
         arguments = settings | {"policy_kwargs": {"config": self.config}, "device": "cpu"}
         super().__init__(policy, env, learning_rate=getattr(config, "step_size", 0.0), **arguments)
@@ -377,7 +405,7 @@ class SARSA(BaseAlgorithm):
             self._generator = np.random.default_rng(np.random.SeedSequence(self.seed).spawn(1)[0])
         self.policy = self.policy_class(
             self.observation_space, self.action_space, **self.policy_kwargs
-        )  # type: ignore[assignment]
+        )
         coder, table = self.policy.coder, self.policy.table
         self._learner = Learner(
             coder,
@@ -401,10 +429,10 @@ class SARSA(BaseAlgorithm):
         """Restore the result of `snapshot`; training then continues bit-identically."""
         set_generator_words(self._generator, snapshot["generator"])
 
-    def learn(  # type: ignore[override]
+    def learn(
         self,
         total_timesteps: int,
-        callback: Any = None,
+        callback: MaybeCallback = None,
         log_interval: int | None = 100,
         tb_log_name: str = "SARSA",
         reset_num_timesteps: bool = True,
@@ -434,7 +462,7 @@ class SARSA(BaseAlgorithm):
         learner = self._learner._replace(epsilon=self.exploration_rate)
         if self.compiled and CompiledEpisodes.can_run(self.env):
             if self._episodes is None or self._episodes.env is not self.env:
-                self._episodes = CompiledEpisodes(self.env)  # type: ignore[arg-type]
+                self._episodes = CompiledEpisodes(self.env)
             if (episode := self._episodes.run(learner, self._generator)) is not None:
                 return self._count(callback, *episode)
         return self._run_steps(callback, learner)
@@ -448,7 +476,7 @@ class SARSA(BaseAlgorithm):
             new_obs, rewards, dones, infos = self.env.step(np.array([action]))
             info = infos[0]
             terminated = bool(dones[0]) and not info.get("TimeLimit.truncated", False)
-            observation = info["terminal_observation"] if dones[0] else new_obs[0]  # type: ignore[index]
+            observation = info["terminal_observation"] if dones[0] else new_obs[0]
             action = learn(
                 learner, self._generator, action, float(rewards[0]), observation, terminated
             )
@@ -462,11 +490,11 @@ class SARSA(BaseAlgorithm):
         self,
         callback: BaseCallback,
         steps: int,
-        new_obs: Any,
+        new_obs: np.ndarray,
         rewards: np.ndarray,
         dones: np.ndarray,
-        infos: list[dict[str, Any]],
-        signals: Any,
+        infos: list[Info],
+        signals: Signals | None,
     ) -> bool:
         """Count steps, and call the callback."""
         # The callback reads the arguments from these locals, by the names that Stable-Baselines3
@@ -476,7 +504,8 @@ class SARSA(BaseAlgorithm):
         self._episode_num += int(dones[0])
         self._update_info_buffer(infos, dones)
         callback.update_locals(locals())
-        return callback.on_step()
+        goes_on: bool = callback.on_step()
+        return goes_on
 
     def dump_logs(self) -> None:
         """Write statistics of the training to the log."""

@@ -8,14 +8,21 @@ networks, forward and backward, by a few batched matrix products, and keeps all 
 vector.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-_ACTIVATIONS: dict[type[nn.Module], tuple[Any, Any]] = {
+StateDict = dict[str, Any]
+"""Result of an optimizer's `state_dict`: nested mappings and lists, of tensors and settings."""
+_ACTIVATIONS: dict[
+    type[nn.Module],
+    tuple[
+        Callable[[torch.Tensor], torch.Tensor], Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+    ],
+] = {
     nn.Tanh: (torch.tanh, torch.ops.aten.tanh_backward),
     nn.ReLU: (
         torch.relu,
@@ -95,7 +102,7 @@ class StackedNetworks:
 
         The parameters of a copied policy are not.
         """
-        return policy.action_net.weight.data_ptr() == self.weights[-1].data_ptr()
+        return bool(policy.action_net.weight.data_ptr() == self.weights[-1].data_ptr())
 
     def act(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the actor's last hidden layer (N, h) and outputs (N, a) for features (N, k)."""
@@ -131,18 +138,20 @@ class StackedNetworks:
                 gradient = self._slope(torch.bmm(gradient, self.weights[index]), layers[index])
 
 
-class VectorAdam(torch.optim.Adam):
+class VectorAdam(torch.optim.Adam):  # mypy does not read the base
     """Adam on one vector, with the state dict of an Adam on the parameters that are views of it.
 
     Saved models can therefore be exchanged with Stable-Baselines3 in both directions.
     """
 
-    def __init__(self, vector: torch.Tensor, views: Iterable[nn.Parameter], **options: Any) -> None:
+    def __init__(
+        self, vector: torch.Tensor, views: Iterable[nn.Parameter], **options: object
+    ) -> None:
         """Optimize a vector by `vector.grad`; the views are in the order of an ordinary Adam."""
         super().__init__([vector], fused=True, **options)
         self._layout = [(view.shape, view.stride(), view.storage_offset()) for view in views]
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> StateDict:
         """Return the state dict, with the moments of each parameter."""
         own_state = super().state_dict()
         moments = own_state["state"].get(0, {})
@@ -156,7 +165,7 @@ class VectorAdam(torch.optim.Adam):
         group = own_state["param_groups"][0] | {"params": list(state)}
         return {"state": state if moments else {}, "param_groups": [group]}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: StateDict) -> None:
         """Load a state dict with the moments of each parameter."""
         state, group = state_dict["state"], state_dict["param_groups"][0]
         if len(group["params"]) != len(self._layout):

@@ -5,17 +5,22 @@ import functools
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from codrl_mj.catalogue.derivation import MotorParameters, derive
-from codrl_mj.catalogue.units import QuantitySpec, parse_value
+from codrl_mj.catalogue.units import ParsedValue, QuantitySpec, parse_value
 from codrl_mj.fields import check_names, command
 from codrl_mj.user_code import asset_folder, read_text
+
+T = TypeVar("T")
+# A file and a user may give values of any type: `parse_value` and `_entry` check each of them.
+Unchecked = Any
+"""Value of a datasheet that is not checked yet."""
 
 
 def _printed(
     unit: str, example: str, gear_exponent: int = 0, allow_zero: bool = False, synonyms: str = ""
-) -> Any:
+) -> str | None:
     """Return a field for a printed value; `synonyms` are its other common names."""
     return dataclasses.field(
         default=None,
@@ -117,8 +122,8 @@ class Datasheet:
             raise ValueError(f"datasheet.shaft = {self.shaft!r}: must be motor or output")
         self.parsed_values()
 
-    def parsed_values(self) -> dict[str, Any]:
-        """Return the printed values as `ParsedValue`, each in SI units at its stated shaft.
+    def parsed_values(self) -> dict[str, ParsedValue]:
+        """Return the printed values, each in SI units at its stated shaft.
 
         Raises:
             ValueError: a value has no unit or a wrong one, is not positive, or an efficiency
@@ -200,13 +205,13 @@ _UNSUPPORTED = {
 }
 
 
-def to_field_names(printed: Mapping[str, Any]) -> dict[str, Any]:
+def to_field_names(printed: Mapping[str, T]) -> dict[str, T]:
     """Convert names of printed values (in any case, also common synonyms) to names of fields.
 
     Raises:
         ValueError: a name is unknown, or a field has two values.
     """
-    values: dict[str, Any] = {}
+    values: dict[str, T] = {}
     for name, value in printed.items():
         field = _FIELD_BY_OTHER_NAME.get(name.lower(), name.lower())
         if field in _UNSUPPORTED:
@@ -226,7 +231,7 @@ def to_field_names(printed: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def from_datasheet(
-    *, strict: bool = True, tolerance: float = 0.2, **printed: Any
+    *, strict: bool = True, tolerance: float = 0.2, **printed: Unchecked
 ) -> MotorParameters:
     """Return a motor's parameters in SI units from its printed datasheet.
 
@@ -339,9 +344,9 @@ def motor_entry(name: str) -> MotorEntry:
         raise ValueError(f"motor {name!r} ({path}): {error}") from error
 
 
-def _entry(name: str, content: dict[str, Any], is_custom: bool) -> MotorEntry:
+def _entry(name: str, content: dict[str, Unchecked], is_custom: bool) -> MotorEntry:
     """Return the motor described by a file; a custom file may omit manufacturer and sources."""
-    optional: dict[str, Any] = {"estimated": {}, "notes": "", "tolerance": 0.2}
+    optional: dict[str, Unchecked] = {"estimated": {}, "notes": "", "tolerance": 0.2}
     if is_custom:
         optional |= {"manufacturer": "", "product": name, "kind": "", "sources": {}}
     names = [f.name for f in dataclasses.fields(MotorEntry) if f.name != "name"]
@@ -375,7 +380,7 @@ def _entry(name: str, content: dict[str, Any], is_custom: bool) -> MotorEntry:
     return MotorEntry(**content)
 
 
-def _sources(sources: Mapping[str, Any], printed: list[str]) -> dict[str, str]:
+def _sources(sources: Mapping[str, Unchecked], printed: list[str]) -> dict[str, str]:
     """Return the source of each printed value, from the lists of values of each source."""
     source_by_value: dict[str, str] = {}
     for source, values in sources.items():

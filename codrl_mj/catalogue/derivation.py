@@ -11,7 +11,7 @@ import functools
 import re
 from collections.abc import Mapping, Sequence
 from types import CodeType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from codrl_mj.catalogue.units import ParsedValue, QuantitySpec
 
@@ -387,7 +387,7 @@ class _Derivation:
         Torques at the output, and `lossy_quantities`, depend on the efficiency of the gear: they
         are stored as they are, under names that end in `_at_output`.
         """
-        self.values: dict[str, Any] = {}
+        self.values: dict[str, float] = {}
         self.origins: dict[str, str] = {}
         self._units = {name: spec.unit for name, spec in specs.items()}
         self._units |= {name: self._units[name.removesuffix("_at_output")] for name in AT_OUTPUT}
@@ -424,7 +424,7 @@ class _Derivation:
             formula,
         )
 
-    def _add(self, name: str, formula: str, value: Any, remark: str = "") -> None:
+    def _add(self, name: str, formula: str, value: float, remark: str = "") -> None:
         """Add a quantity, with its formula and a remark as its origin."""
         self.values[name] = value
         self.origins[name] = (

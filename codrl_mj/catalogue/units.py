@@ -3,8 +3,17 @@
 import functools
 import math
 import re
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, Self, TypeVar
 
+
+class Scalable(Protocol):
+    """A number, or an array of numbers."""
+
+    def __mul__(self, factor: float, /) -> Self:
+        """Multiply by a factor."""
+
+
+T = TypeVar("T", bound=Scalable)
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _PRINTED = re.compile(
     rf"\s*({_NUMBER}(?:\s*\*\s*{_NUMBER})*)\s*(.*?)\s*(?:\bat\s+(?:the\s+)?(motor|output))?\s*",
@@ -88,7 +97,7 @@ class ParsedValue(NamedTuple):
     """`motor`, `output`, or None if not stated."""
 
 
-def parse_value(name: str, printed: Any, spec: QuantitySpec) -> ParsedValue:
+def parse_value(name: str, printed: object, spec: QuantitySpec) -> ParsedValue:
     """Parse a printed value, such as `25.1 mN*m/A`, `2 * 0.3 ohm` or `2.42 N*m at output`.
 
     The value of a quantity without a unit, such as a gear ratio, may also be a number.
@@ -134,9 +143,8 @@ def parse_value(name: str, printed: Any, spec: QuantitySpec) -> ParsedValue:
     if not unit and spec.unit:
         raise ValueError(f"datasheet.{name} = {printed!r}: has no unit; {remedy}")
     try:
-        value = float(
-            to_si(math.prod(map(float, factors.split("*"))), unit, spec.unit, mass_as_weight=True)
-        )
+        number = float(math.prod(map(float, factors.split("*"))))
+        value = float(to_si(number, unit, spec.unit, mass_as_weight=True))
     except ValueError as error:
         raise ValueError(f"datasheet.{name} = {printed!r}: {error}; {remedy}") from error
     bound = "a finite number >= 0" if spec.allow_zero else "a finite number > 0"
@@ -149,12 +157,12 @@ def parse_value(name: str, printed: Any, spec: QuantitySpec) -> ParsedValue:
 
 
 def to_si(
-    number: Any,
+    number: T,
     unit: str,
     si_unit: str | None,
     quantity_name: str = "this quantity",
     mass_as_weight: bool = False,
-) -> Any:
+) -> T:
     """Convert a number to the SI unit of its quantity, or to SI base units for `si_unit` None.
 
     Args:
@@ -177,7 +185,8 @@ def to_si(
     try:
         quantity = registry.Quantity(number, spelling)
         if si_unit is None:
-            return quantity.to_base_units().magnitude
+            in_base_units: T = quantity.to_base_units().magnitude
+            return in_base_units
         unit_size = registry.Quantity(1.0, spelling)
         zero = registry.Quantity(0.0, spelling).to_root_units().magnitude
     except Exception as error:
@@ -216,11 +225,17 @@ def to_si(
             raise ValueError(f"{unit!r} is a difference of temperatures, must be a temperature")
     elif zero != 0.0:
         raise ValueError(f"{unit!r} is logarithmic, must be proportional to the quantity")
-    return quantity.to(si_unit or "dimensionless").magnitude
+    converted: T = quantity.to(si_unit or "dimensionless").magnitude
+    return converted
+
+
+# mypy does not read pint.
+UnitRegistry = Any
+"""A `pint.UnitRegistry`."""
 
 
 @functools.cache
-def unit_registry() -> Any:
+def unit_registry() -> UnitRegistry:
     """Return pint's registry of units; importing it takes half a second, so this is lazy."""
     import pint
 

@@ -16,14 +16,15 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn, Protocol, cast
 
 import gymnasium
 import mujoco
 
 import codrl_mj
+from codrl_mj.boundary import Json
 from codrl_mj.cli.extras import missing_module_message
-from codrl_mj.cli.parsing import normalize_arguments, parse
+from codrl_mj.cli.parsing import Output, normalize_arguments, parse
 from codrl_mj.runs.files import check_file, check_page, check_writable
 from codrl_mj.user_code import FILES_TRUSTED
 
@@ -101,10 +102,18 @@ _OUTPUT_FILE_CHECKS: dict[str, Callable[[Path], None]] = {
 """Verbs whose `--out` is a file instead of a folder -> the check of that path."""
 
 
-def find_verb(name: str) -> Any:
+class Verb(Protocol):
+    """Parsed command line."""
+
+    def run(self) -> int | Output:
+        """Return the exit status; a verb with --json also returns the content to print."""
+
+
+def find_verb(name: str) -> type[Verb]:
     """Return the class of a verb."""
     module, _, kind = VERBS[name].partition(":")
-    return getattr(importlib.import_module(f"codrl_mj.cli.{module}"), kind)
+    verb: type[Verb] = getattr(importlib.import_module(f"codrl_mj.cli.{module}"), kind)
+    return verb
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -175,8 +184,9 @@ def _run(arguments: list[str], traced: bool) -> int:
 
 def _print_help(words: Sequence[str]) -> NoReturn:
     """Print the help of all verbs, or of the group that the first word names, and exit."""
-    description, group = _DESCRIPTION, words[0] if words[:1] and words[0] in VERB_HELP else ""
-    descriptions = {
+    description: str | None = _DESCRIPTION
+    group = words[0] if words[:1] and words[0] in VERB_HELP else ""
+    descriptions: dict[str, str | None] = {
         name: f"{sentence}\n\nExample: codrl-mj {name} {example}"
         for name, (sentence, example) in VERB_HELP.items()
     }
@@ -191,19 +201,20 @@ def _print_help(words: Sequence[str]) -> NoReturn:
     raise SystemExit
 
 
-def _run_verb(verb: Any) -> int:
+def _run_verb(verb: Verb) -> int:
     """Run a verb; with --json, print only the content that it returns beside its exit status."""
     if not getattr(verb, "as_json", False):
         result = verb.run()
         return int(result[0] if isinstance(result, tuple) else result)
     # Tables that the verb prints for people are discarded.
     with contextlib.redirect_stdout(io.StringIO()):
-        status, content = verb.run()
+        # Verbs with this flag return content too.
+        status, content = cast(Output, verb.run())
     print(json.dumps(_to_json_value(content), indent=2, allow_nan=False))
     return int(status)
 
 
-def _to_json_value(content: Any) -> Any:
+def _to_json_value(content: object) -> Json:
     """Convert a value to JSON types: objects to mappings, and NaN and infinity to null."""
     for method in ("as_mapping", "summary", "_asdict"):
         if hasattr(content, method):
@@ -218,7 +229,7 @@ def _to_json_value(content: Any) -> Any:
     return str(content) if isinstance(content, Path) else content
 
 
-def _check_outputs(verb: Any) -> None:
+def _check_outputs(verb: Verb) -> None:
     """Raise an error if an output path cannot be written, before anything is computed."""
     kind = type(verb).__name__
     checks = {
@@ -288,7 +299,7 @@ def _show_each_once() -> Callable[..., None]:
     """
     shown = set()
 
-    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+    def show(message: Warning | str, *_: object, **__: object) -> None:
         if str(message) not in shown:
             shown.add(str(message))
             _show_warning(message)

@@ -1,14 +1,21 @@
 """`codrl-mj advise`."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.parsing import AsJson, Trust
+from codrl_mj.actuators import ActuatorSetting
+from codrl_mj.cli.parsing import AsJson, Output, Trust
 from codrl_mj.cli.terminal import print_table, print_text
 from codrl_mj.fields import did_you_mean
+from codrl_mj.study.evidence import Evidence, LossBounds, Outcome
+
+# `codrl_mj.study.advice` loads the engine, so only the running verb imports it.
+Advice = Any
+"""Class of this name in `codrl_mj.study.advice`."""
 
 _DELIVERED = {
     # field of Delivery: (label, unit, number format)
@@ -74,11 +81,10 @@ class Advise:
     trust: Trust = False
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Print the severities and the known remedies, then the verdict."""
         from codrl_mj.study.advice import advise
         from codrl_mj.study.axes import REFERENCE_SPEEDS, study_env
-        from codrl_mj.study.evidence import Evidence
 
         is_studied = self.task in REFERENCE_SPEEDS
         if not is_studied and self.measure is None:
@@ -91,7 +97,7 @@ class Advise:
             raise ValueError(
                 f"--measure {self.measure}: must be >= 2, because an interval needs two policies"
             )
-        actuator_spec: Any = self.actuator
+        actuator_spec: ActuatorSetting = self.actuator
         if self.gear_ratio is not None or self.voltage is not None:
             motor = {} if self.gear_ratio is None else {"motor": {"gear_ratio": self.gear_ratio}}
             supply = {} if self.voltage is None else {"supply": {"voltage": self.voltage}}
@@ -99,7 +105,7 @@ class Advise:
         advice = None
         if is_studied:
             try:
-                actuator = study_env(self.task, actuator_spec).actuator
+                actuator = study_env(self.task, actuator_spec).actuators[0]
             except ValueError as error:
                 overrides = {"--gear-ratio": self.gear_ratio, "--voltage": self.voltage}
                 flags = ", ".join(flag for flag, value in overrides.items() if value is not None)
@@ -132,11 +138,11 @@ class Advise:
         return 0, {"units": units, "advice": advice, "measured": measured}
 
 
-def _print_advice(name: str, advice: Any) -> None:
+def _print_advice(name: str, advice: Advice) -> None:
     from codrl_mj.study.axes import AXES
 
     columns = "effect on the largest force", "value", "unit"
-    rows: list[tuple[Any, ...]] = [
+    rows: list[tuple[str, ...]] = [
         (label, format(getattr(advice.response, field), digits), unit)
         for field, (label, unit, digits) in _DELIVERED.items()
     ]
@@ -169,7 +175,7 @@ def _print_advice(name: str, advice: Any) -> None:
 _LOSS_COLUMNS = "loss", "95 %", "fail", "success\nlost"
 
 
-def _print_options(title: str, options: Any) -> None:
+def _print_options(title: str, options: Mapping[str, LossBounds]) -> None:
     from codrl_mj.study.advice import OPTIONS
 
     rows = []
@@ -194,7 +200,7 @@ def _print_options(title: str, options: Any) -> None:
     )
 
 
-def _loss_cells(outcome: Any, bound: str) -> tuple[str, ...]:
+def _loss_cells(outcome: Outcome, bound: str) -> tuple[str, ...]:
     mean, low, high = outcome.loss
     count = len(outcome.lost)
     failed = f"{round(outcome.failed * count)} of {count}"

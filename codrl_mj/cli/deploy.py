@@ -2,23 +2,28 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
 from codrl_mj.actuators import family_name
+from codrl_mj.boundary import Json
 from codrl_mj.cli.environments import (
     AS_TRAINED,
     ActuatorName,
+    EnvironmentVerb,
     build_env_config,
-    with_environment_flags,
 )
-from codrl_mj.cli.parsing import AsJson, Trust, parse_named_numbers
+from codrl_mj.cli.parsing import AsJson, Output, Trust, parse_named_numbers
 from codrl_mj.cli.subject import Source, Subject
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import command, differences
 
+# `codrl_mj.deploy` takes a while to import, so only the verbs that use it import it.
+RigComparison = Any
+"""Class of this name in `codrl_mj.deploy.compare`."""
 Exported = Annotated[
     tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER", help="Folder that export wrote.")
 ]
@@ -26,7 +31,7 @@ Exported = Annotated[
 
 
 @dataclasses.dataclass(frozen=True)
-class Export:
+class Export(EnvironmentVerb):
     """Export a trained policy as ONNX and C99, with all its assumptions in contract.json.
 
     The contract lists names, units, order and range of observations and actions, the rate, the
@@ -67,9 +72,7 @@ class Export:
     raspberry-pi-pico or teensy-4.1.
     """
 
-    for_line = classmethod(with_environment_flags)
-
-    def run(self: Any) -> int:
+    def run(self) -> int:
         """Write the folder and print its content."""
         from codrl_mj.cli.terminal import print_table
         from codrl_mj.deploy import export, extract_network
@@ -110,7 +113,7 @@ class Export:
         )
         return 0
 
-    def _environment(self: Any, subject: Subject) -> EnvConfig:
+    def _environment(self, subject: Subject) -> EnvConfig:
         """Return the environment of the training, from the run folder or, for a zip, from flags."""
         from codrl_mj.training.folder import load_config
 
@@ -131,7 +134,7 @@ class Export:
         return subject.env
 
 
-def _bounds(entry: dict[str, Any]) -> str:
+def _bounds(entry: Mapping[str, Json]) -> str:
     if "levels" in entry:
         return f"one of {', '.join(f'{level:g}' for level in entry['levels'])}"
     low, high = entry.get("least"), entry.get("most")
@@ -365,7 +368,7 @@ class CompareLog:
     trust: Trust = False
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Compare, print a table, and draw the curves."""
         from codrl_mj.cli.terminal import print_table
         from codrl_mj.deploy import Contract, compare
@@ -406,12 +409,12 @@ class CompareLog:
         return 0, [dict(zip(keys, row, strict=True)) for row in columns]
 
 
-def _draw(comparison: Any, out: Path) -> None:
+def _draw(comparison: RigComparison, out: Path) -> None:
     """Draw logged and simulated curves of every entry, with gaps where the simulation restarts."""
     import numpy as np
 
     from codrl_mj.cli.motor import save_plot
-    from codrl_mj.viz.pages.plots import Curve, Plot
+    from codrl_mj.plots import Curve, Plot
 
     simulated = comparison.simulated.copy()
     # A NaN interrupts the line, so that no vertical stroke joins the end of one window to the start

@@ -8,13 +8,14 @@ import typing
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeVar
 
 import tyro
 
 from codrl_mj.actuators import (
     FAMILIES,
     NAMED,
+    ActuatorSetting,
     DCMotorActuator,
     Ideal,
     Supply,
@@ -22,19 +23,54 @@ from codrl_mj.actuators import (
     identified_ranges,
     override_actuator,
 )
+from codrl_mj.actuators.parameters import FieldValue
+from codrl_mj.boundary import Argument
+from codrl_mj.cli.parsing import Annotation
 from codrl_mj.envs.config import EnvConfig, EnvSource, find_source, is_source_name
 from codrl_mj.fields import field_docs, nested_types
 from codrl_mj.runs import CONFIG
 from codrl_mj.tasks import TASKS
 from codrl_mj.user_code import allow_imports_from_files, read_yaml
 
+# The dataclasses of the flags are built at run time, from fields that depend on the line.
+Flags = Any
+"""Instance of a dataclass that `flag_dataclass` built."""
+FlagField = tuple[str, Annotation] | tuple[str, Annotation, FieldValue]
+"""Name, type and default of a field, as for `dataclasses.make_dataclass`."""
+
+
+class EnvironmentFlags:
+    """Verb with the fields of `environment_fields`."""
+
+    env: Flags
+    """Settings of the environment."""
+    actuators: tuple[str, ...]
+    """Actuators of individual motors, as PATTERN=NAME or as files."""
+    actuator_fields: Flags
+    """Fields that override those of the named actuator; None for the others."""
+
+
+class EnvironmentVerb(EnvironmentFlags):
+    """Verb with flags for an environment, which `with_environment_flags` adds."""
+
+    line: ClassVar[tuple[str, ...]]
+    """Words of the command line after the verb."""
+
+    @classmethod
+    def for_line(cls, arguments: Sequence[str]) -> "type[Self]":
+        """Return the class with its flags for a command line."""
+        return with_environment_flags(cls, arguments)
+
+
+EnvironmentVerbKind = TypeVar("EnvironmentVerbKind", bound=EnvironmentVerb)
+
 
 def flag_dataclass(
     kind: type,
-    defaults: Any = None,
+    defaults: object = None,
     exclude: tuple[str, ...] = (),
-    extra_fields: Sequence[Any] = (),
-) -> Any:
+    extra_fields: Sequence[FlagField] = (),
+) -> type[Flags]:
     """Return a copy of a dataclass and of its nested ones, without validation, for tyro's flags.
 
     The verb validates the values when it builds the real dataclass. Without `defaults` all fields
@@ -47,10 +83,10 @@ def flag_dataclass(
         extra_fields: further fields, as for `dataclasses.make_dataclass`.
     """
     docs, hints, nested = field_docs(kind), typing.get_type_hints(kind), nested_types(kind)
-    fields: list[Any] = []
+    fields: list[FlagField] = []
     for name in (field.name for field in dataclasses.fields(kind) if field.name not in exclude):
         annotation, value = hints[name], getattr(defaults, name, None)
-        setting: dict[str, Any] = {"help": docs.get(name, "")}
+        setting: dict[str, Argument] = {"help": docs.get(name, "")}
         # The verbs about motors call these flags --gear-ratio and --voltage: accept the short names
         # too.
         if name == "gear_ratio" or (kind is Supply and name == "voltage"):
@@ -107,7 +143,9 @@ the actuator of the configuration file or run.
 """
 
 
-def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: str) -> list[Any]:
+def environment_fields(
+    defaults: EnvConfig, chosen: argparse.Namespace, task: str
+) -> list[FlagField]:
     """Return dataclass fields for the flags of an environment: actuators, settings, options.
 
     The flags of single actuator fields are those of the family that `--actuator` or
@@ -202,7 +240,9 @@ def scan_flags(arguments: Sequence[str], *flag_names: str) -> argparse.Namespace
     return chosen
 
 
-def with_environment_flags(verb: Any, arguments: Sequence[str]) -> Any:
+def with_environment_flags(
+    verb: type[EnvironmentVerbKind], arguments: Sequence[str]
+) -> type[EnvironmentVerbKind]:
     """Return a verb with additional flags for environment and actuator.
 
     The defaults of the flags come from the first run folder that the command line names.
@@ -217,14 +257,16 @@ def with_environment_flags(verb: Any, arguments: Sequence[str]) -> Any:
     elif chosen.task is not None:
         defaults = EnvConfig(chosen.task, DCMotorActuator())
     fields = environment_fields(defaults, chosen, defaults.task)
-    extended_verb: Any = dataclasses.make_dataclass(
+    extended_verb: type[EnvironmentVerbKind] = dataclasses.make_dataclass(
         verb.__name__, fields, bases=(verb,), frozen=True
     )
     extended_verb.__doc__, extended_verb.line = verb.__doc__, tuple(arguments)
     return extended_verb
 
 
-def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> EnvConfig:
+def build_env_config(
+    verb: EnvironmentFlags, task: str, name: str, defaults: EnvConfig
+) -> EnvConfig:
     """Return the environment that a verb's flags describe.
 
     Args:
@@ -275,11 +317,11 @@ def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> En
     return EnvConfig(task, overridden, options=options, **fields)
 
 
-def _patterns(items: Sequence[str]) -> dict[str, Any]:
+def _patterns(items: Sequence[str]) -> dict[str, ActuatorSetting]:
     """Return pattern -> actuator from items PATTERN=NAME and from YAML files."""
     from codrl_mj.engine.specs import resolve_patterns
 
-    actuators: dict[str, Any] = {}
+    actuators: dict[str, ActuatorSetting] = {}
     for item in items:
         if "=" not in item and Path(item).suffix in (".yaml", ".yml", ".json"):
             try:
@@ -299,7 +341,9 @@ def _patterns(items: Sequence[str]) -> dict[str, Any]:
     return actuators
 
 
-def _ranges(randomize: Any, actuator: str, patterns: Mapping[str, Any]) -> Any:
+def _ranges(
+    randomize: tuple[str, ...] | None, actuator: str, patterns: Mapping[str, ActuatorSetting]
+) -> tuple[str, ...] | None:
     """Return `--env.randomize` with `identified` replaced by the intervals of actuator files."""
     if randomize is None or "identified" not in randomize:
         return randomize
@@ -318,7 +362,7 @@ def _ranges(randomize: Any, actuator: str, patterns: Mapping[str, Any]) -> Any:
     return tuple(specs)
 
 
-def _set_fields(fields: Any) -> dict[str, Any]:
+def _set_fields(fields: Flags) -> dict[str, FieldValue]:
     """Return the fields of a nested dataclass that are not None, as nested mappings."""
     return {
         name: _set_fields(value) if dataclasses.is_dataclass(value) else value
@@ -331,10 +375,10 @@ class OptionFlag(NamedTuple):
     """Flag of an environment's option."""
 
     name: str
-    annotation: Any
+    annotation: Annotation
     """Type of its value, as for tyro."""
     help: str
-    default: Any
+    default: FieldValue
 
 
 def _option_flags(config: EnvConfig) -> list[OptionFlag]:
@@ -350,7 +394,7 @@ def _option_flags(config: EnvConfig) -> list[OptionFlag]:
             " else as text."
         )
         return [OptionFlag("options", tuple[str, ...], description, values)]
-    option_types: dict[str, Any] = {name: task.options for name, task in TASKS.items()}
+    option_types: dict[str, type] = {name: task.options for name, task in TASKS.items()}
     return [
         OptionFlag(
             option,
@@ -363,7 +407,7 @@ def _option_flags(config: EnvConfig) -> list[OptionFlag]:
     ]
 
 
-def parse_options(source: EnvSource, flags: Mapping[str, Any]) -> dict[str, Any]:
+def parse_options(source: EnvSource, flags: Mapping[str, FieldValue]) -> dict[str, FieldValue]:
     """Return the options from the values of their flags.
 
     Raises:

@@ -10,20 +10,23 @@ import tyro
 from codrl_mj.cli.environments import (
     AS_TRAINED,
     ActuatorName,
+    EnvironmentVerb,
     build_env_config,
     with_environment_flags,
 )
-from codrl_mj.cli.parsing import AsJson
+from codrl_mj.cli.parsing import AsJson, Output
 from codrl_mj.cli.subject import Source
 from codrl_mj.cli.terminal import format_number, print_table, progress_bar
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import MEASURES, Evaluation, evaluate
 from codrl_mj.evaluation.measures import Interval, Quartiles
 from codrl_mj.runs import unique_names
 from codrl_mj.runs.files import write_json
+from codrl_mj.runs.policies import Policy
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluate:
+class Evaluate(EnvironmentVerb):
     """Measure a policy on any actuator: return, success, torque tracking, voltage, energy, heat.
 
     If there are several motors, a second table lists the measures of each. If you name several
@@ -54,16 +57,15 @@ class Evaluate:
     """JSON file for the result; for several policies, it contains all results by name."""
     as_json: AsJson = False
 
-    for_line = classmethod(with_environment_flags)
-
-    def run(self: Any) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Evaluate the policies and print tables."""
         if not self.policies:
             raise ValueError(
                 "POLICY: none was given; name one or more run folders, such as"
                 " runs/cartpole-ppo-ideal-0"
             )
-        jobs, evaluations = {}, {}
+        jobs: dict[str, tuple[Policy, EnvConfig]] = {}
+        evaluations: dict[str, Evaluation] = {}
         for path, name in zip(self.policies, unique_names(self.policies), strict=True):
             verb = self
             if len(self.policies) > 1:
@@ -127,12 +129,15 @@ def print_evaluations(evaluations: Mapping[str, Evaluation], details: bool = Tru
         _print_details({name: evaluations[name] for name in names[begin : begin + 3]})
 
 
-Columns = Mapping[str, tuple[str, Callable[[Any], str]]]
+# Each measure has the type of its field in `Evaluation`.
+MeasureValue = Any
+"""Value of a measure."""
+Columns = Mapping[str, tuple[str, Callable[[MeasureValue], str]]]
 """Measure -> header of its column, and a function that formats its value."""
 
 
 def _print_measures(
-    title: str, row_header: str, rows: Mapping[str, Mapping[str, Any]], columns: Columns
+    title: str, row_header: str, rows: Mapping[str, Mapping[str, MeasureValue]], columns: Columns
 ) -> None:
     """Print a row for each entry, with a column for each measure that at least one entry has."""
     shown_columns = {

@@ -6,17 +6,20 @@ import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
+from codrl_mj.actuators import Drive
 from codrl_mj.cli.environments import flag_dataclass
 from codrl_mj.cli.motor import MotorName
-from codrl_mj.cli.parsing import AsJson, parse_named_numbers
+from codrl_mj.cli.parsing import AsJson, Output, parse_named_numbers
 from codrl_mj.cli.terminal import format_number, print_table, print_text, progress_bar
 from codrl_mj.fields import command
+from codrl_mj.identify.log import Finding, Log
 from codrl_mj.identify.plan import Sensing
-from codrl_mj.identify.synthetic import FREE, Load, Sampler
+from codrl_mj.identify.result import Identified
+from codrl_mj.identify.synthetic import FREE, Load, Sampler, Sensor
 
 Columns = Annotated[
     str,
@@ -89,7 +92,7 @@ class Identify:
     """Fit the logs even if the checks find errors in them."""
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Check the logs, fit the parameters, print a table, and write the files."""
         from codrl_mj.identify.identify import check_arguments, identify, predict_missing
         from codrl_mj.identify.reading import read_log
@@ -100,10 +103,10 @@ class Identify:
             [read_log(path, self.columns) for path in paths] for paths in (self.logs, self.holdout)
         )
         known = parse_named_numbers("--known", self.known, "mgl=2.81, in SI units")
-        base_drive: Any = None if self.motor is None else find_drive(self.motor)
+        base_drive = None if self.motor is None else find_drive(self.motor)
         if base_drive is not None and "gear_ratio" in known:
             base_drive = base_drive.replaced({"motor.gear_ratio": known["gear_ratio"]})
-        mapping = base_drive and base_drive.as_mapping()
+        mapping = None if base_drive is None else base_drive.as_mapping()
         fit_arguments = logs, self.rig, known, self.friction
         all_known = check_arguments(*fit_arguments, self.estimate, self.segment, mapping)
         if problem_text := predict_missing(logs, all_known, mapping):
@@ -147,12 +150,12 @@ class Identify:
         units = {estimate.name: estimate.unit for estimate in result.estimates}
         return int(problem is not None), result.as_mapping() | {"units": units}
 
-    def _check(self, logs: list[Any], held_out: list[Any], base_drive: Any) -> list[Any]:
+    def _check(self, logs: list[Log], held_out: list[Log], base_drive: Drive | None) -> list[Log]:
         """Print the problems of the logs, and return the held-out logs that have no errors."""
         from codrl_mj.identify.checks import check
 
         checked_logs = [
-            (log, check(log, base_drive and base_drive.motor, self.rig))
+            (log, check(log, None if base_drive is None else base_drive.motor, self.rig))
             for log in (*logs, *held_out)
         ]
         bad_logs = [
@@ -180,12 +183,12 @@ class Identify:
         return [log for log in held_out if not any(log is bad_log for bad_log in bad_logs)]
 
 
-def print_identification(result: Any) -> None:
+def print_identification(result: Identified) -> None:
     """Print parameters and simulation errors, and the notes on them."""
     from codrl_mj.identify.log import SIGNALS
     from codrl_mj.identify.result import USABLE
 
-    rows: list[Any] = []
+    rows: list[tuple[str, ...]] = []
     for estimate in result.estimates:
         interval = (
             "" if estimate.status == "given" else f"{estimate.low:.4g} to {estimate.high:.4g}"
@@ -249,7 +252,7 @@ class CheckLogs:
     """Load on the output, as for the fit. Without this flag, the checks allow for a pendulum."""
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Print a table of findings for each log."""
         from codrl_mj.identify.checks import check
         from codrl_mj.identify.reading import read_log
@@ -278,7 +281,7 @@ class CheckLogs:
         ]
 
 
-def print_findings(title: str, findings: Sequence[Any]) -> None:
+def print_findings(title: str, findings: Sequence[Finding]) -> None:
     """Print findings of `codrl_mj.identify.checks.check` as a table, or that there are none."""
     if not findings:
         print_text(f"{title}: no problems found")
@@ -331,7 +334,7 @@ class PlanExperiment:
     """Folder for excitation.csv, the voltage to apply to the motor."""
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Print the options, the best one last."""
         from codrl_mj.identify.plan import GOALS, plan, write_excitation
         from codrl_mj.sizing import find_drive, find_entry
@@ -479,11 +482,11 @@ class SimulateLog:
         return 0
 
 
-def _sensors(texts: Sequence[str]) -> dict[str, Any]:
+def _sensors(texts: Sequence[str]) -> dict[str, Sensor]:
     from codrl_mj.fields import check_names
-    from codrl_mj.identify.synthetic import Sensor
 
-    field_names, sensors = [field.name for field in dataclasses.fields(Sensor)], {}
+    field_names = [field.name for field in dataclasses.fields(Sensor)]
+    sensors: dict[str, Sensor] = {}
     for text in texts:
         signal, _, rest = text.partition(":")
         if signal in sensors:
@@ -513,7 +516,7 @@ class ProposeColumns:
     log: Annotated[tyro.conf.Positional[Path], _FILE]
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Print the mapping, the doubtful columns, and the next command."""
         from codrl_mj.identify.columns import OPEN_UNIT
         from codrl_mj.identify.proposal import propose_columns

@@ -2,14 +2,19 @@
 
 import dataclasses
 import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
-from codrl_mj.cli.parsing import AsJson
+from codrl_mj.actuators import Drive
+from codrl_mj.boundary import Argument
+from codrl_mj.cli.parsing import AsJson, Output
 from codrl_mj.cli.terminal import format_number, print_table, print_text
 from codrl_mj.fields import command
+from codrl_mj.plots import Plot
+from codrl_mj.sizing.limits import MotorReport, Quantity
 
 MotorName = Annotated[
     tyro.conf.Positional[str],
@@ -46,11 +51,11 @@ class Changes:
     max_current: float | None = None
     """Current limit of the drive [A]."""
 
-    def drive(self, name: str) -> Any:
+    def drive(self, name: str) -> Drive:
         """Return the named drive, changed to these values."""
         from codrl_mj.sizing import find_drive
 
-        overrides: dict[str, Any] = dict(vars(self))
+        overrides: dict[str, Argument] = dict(vars(self))
         if overrides.pop("not_delayed") == overrides["delayed"]:
             overrides["delayed"] = None
         if self.delayed and self.not_delayed:
@@ -91,7 +96,7 @@ class List:
     """Order: names from A to Z, numbers descending."""
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Print the table."""
         from codrl_mj.catalogue.datasheet import QUANTITY_SPECS
         from codrl_mj.catalogue.derivation import PRINTED_NAMES
@@ -145,7 +150,7 @@ class Show:
     """HTML file for a page with these tables, the current loop and its step responses."""
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Print the tables and draw the diagram."""
         from codrl_mj.sizing import describe_motor, find_entry, find_loop
 
@@ -154,7 +159,7 @@ class Show:
         if self.out is not None:
             from codrl_mj.viz.pages.diagrams import torque_speed_diagram
 
-            figure = torque_speed_diagram(drive, entry and entry.parameters)
+            figure = torque_speed_diagram(drive, None if entry is None else entry.parameters)
         _print_explanation(
             f"{self.name}: {entry.title}" if entry else "", drive.voltage_limit, explanation
         )
@@ -168,18 +173,16 @@ class Show:
         return 0, explanation
 
 
-def _print_explanation(title: str, volts: float, explanation: dict[str, Any]) -> None:
+def _print_explanation(title: str, volts: float, explanation: MotorReport) -> None:
     """Print the limits of a motor, then its parameters, then the notes on them."""
     from codrl_mj.sizing import describe_unknown
 
-    def show(title: str, part: str) -> None:
-        rows = [
-            (row["name"], format_number(row["value"], 4), row["unit"]) for row in explanation[part]
-        ]
+    def show(title: str, quantities: Iterable[Quantity]) -> None:
+        rows = [(row["name"], format_number(row["value"], 4), row["unit"]) for row in quantities]
         print_table(title, ("number", "value", "unit"), rows, right=("value",))
 
     print_text(title)
-    show(f"Limits at the output, at {volts:g} V", "abilities")
+    show(f"Limits at the output, at {volts:g} V", explanation["abilities"])
     print_text(explanation["assumed"])
     if "numbers" in explanation:
         rows = []
@@ -199,7 +202,7 @@ def _print_explanation(title: str, volts: float, explanation: dict[str, Any]) ->
         print_table(
             "The motor, at its rotor", columns, rows, right=("value",), whole=("number", "unit")
         )
-    show("As it is simulated", "drive")
+    show("As it is simulated", explanation["drive"])
     if "numbers" in explanation:
         for kind, texts in (
             ("disagreement", explanation["disagreements"]),
@@ -263,7 +266,7 @@ class Design:
     """Folder for bode.png: the open and the closed loop, with the margins."""
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Print the table and draw the Bode plot."""
         from codrl_mj.sizing import (
             LoopAnalysis,
@@ -341,7 +344,7 @@ class Step:
     """Folder for step.png: current, torque and voltage."""
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Print the table and draw the responses."""
         from codrl_mj.sizing import step_responses, undersampling_warning
 
@@ -416,9 +419,9 @@ class New:
         return 0
 
 
-def save_plot(figure: Any, path: Path) -> None:
+def save_plot(figure: Plot | Sequence[Plot], path: Path) -> None:
     """Write a figure to a PNG file and print its path."""
-    from codrl_mj.viz.pages.plots import save_png
+    from codrl_mj.plots import save_png
 
     save_png(figure, path)
     print(f"wrote {path}")

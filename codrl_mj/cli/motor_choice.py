@@ -3,15 +3,20 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
+from rich.console import RenderableType
 from rich.text import Text
 
+from codrl_mj.actuators import Drive
 from codrl_mj.cli.motor import save_plot
-from codrl_mj.cli.parsing import AsJson, Trust
+from codrl_mj.cli.parsing import AsJson, Output, Trust
 from codrl_mj.cli.terminal import print_table, print_text
 from codrl_mj.runs import unique_names
+from codrl_mj.sizing.choice import Candidate
+from codrl_mj.sizing.demand import Demand
+from codrl_mj.sizing.feasibility import OperatingPoints
 
 TaskOrRun = Annotated[
     tyro.conf.Positional[str],
@@ -66,7 +71,7 @@ class Feasible:
     trust: Trust = False
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Print the bounds, then the verdict."""
         from codrl_mj import sizing
         from codrl_mj.sizing import (
@@ -89,7 +94,7 @@ class Feasible:
         title = (
             f"{self.name}, {_gear_text(drive, demand)}, {drive.voltage_limit:g} V: {demand.source}"
         )
-        rows: list[Any] = []
+        rows: list[tuple[RenderableType, ...]] = []
         for bound in judgment.bounds:
             # Unknown numbers are NaN, which differs from itself.
             numbers = (
@@ -191,7 +196,7 @@ class Choose:
     trust: Trust = False
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Print the ranking, or for several motors the best choice for each."""
         import yaml
 
@@ -290,7 +295,7 @@ _UNITS = {
 }
 
 
-def _operation_mapping(required: Any) -> dict[str, Any]:
+def _operation_mapping(required: OperatingPoints) -> dict[str, float]:
     """Return the numbers of an episode's operation, with names as in `_UNITS`."""
     fields = {
         name: getattr(required, name)
@@ -327,18 +332,18 @@ def _split_words(words: Sequence[str]) -> tuple[str, list[str]]:
     return subjects[0], [word for word in words if word != subjects[0]]
 
 
-def _gear_text(drive: Any, demand: Any) -> str:
+def _gear_text(drive: Drive, demand: Demand) -> str:
     """Return the gear of a drive as text, in rad/m on a slide."""
     return f"gear {1.0 / drive.arm_radius:.4g}{' rad/m' if demand.linear else ''}"
 
 
-def _own_share_text(drive: Any, required: Any) -> str:
+def _own_share_text(drive: Drive, required: OperatingPoints) -> str:
     """Return the share of the load that rotor and friction take, if the inertia is known."""
     return f"{required.own_share:.0%}" if drive.motor.rotor_inertia > 0.0 else "unknown"
 
 
 def _print_ranking(
-    choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], title: str
+    choices: Sequence[tuple[str, Candidate]], demands: Mapping[str, Demand], title: str
 ) -> None:
     """Print a row for each choice; with several motors, the first column is the driven motor."""
     columns: tuple[str, ...]
@@ -390,7 +395,7 @@ def _print_ranking(
     )
 
 
-def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
+def _draw(drive: Drive, demand: Demand, name: str, path: Path) -> None:
     """Draw the torque-speed diagram of a drive with the operating points of a demand.
 
     The points are at the output of the gear and include the torque that the rotor's inertia needs.

@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, TypeVar, Union
 
 import tyro
 
@@ -26,6 +26,16 @@ _PATHS = (
     "--policies",
 )
 _MOTOR_FLAGS = {"--gear-ratio": "gear ratio", "--voltage": "supply voltage"}
+
+Output = tuple[int, object]
+"""Exit status of a verb, and the content that `--json` prints."""
+Verb = TypeVar("Verb")
+"""Dataclass of a verb."""
+# The flags of some verbs depend on the line, so their types are built at run time.
+Annotation = Any
+"""Type of a flag's values for tyro, such as `str | None` or `Annotated[...]`."""
+ParseEvent = Any
+"""Error of tyro's parser, or an argument in it; tyro's classes for them are private."""
 
 AsJson = Annotated[
     bool,
@@ -62,34 +72,41 @@ def parse_named_numbers(flag: str, texts: Sequence[str], example: str) -> dict[s
     return numbers
 
 
-def parse(kind: Any, program: str, words: Sequence[str], description: str | None = None) -> Any:
+def parse(
+    kind: type[Verb] | Mapping[str, str | None],
+    program: str,
+    words: Sequence[str],
+    description: str | None = None,
+) -> Verb:
     """Parse words into an instance of a verb's dataclass; a help flag raises SystemExit.
 
     A mapping of verbs to descriptions is parsed only to print its help.
     """
     # The union of verbs is built at run time, which the annotations of `tyro.cli` do not cover.
     cli: Any = tyro.cli
+    form: Annotation = kind
     if isinstance(kind, Mapping):
         verbs = [
             dataclasses.make_dataclass(name, [], namespace={"__doc__": text})
             for name, text in kind.items()
         ]
-        kind = Union[tuple(Annotated[verb, tyro.conf.subcommand(verb.__name__)] for verb in verbs)]  # noqa: UP007
+        form = Union[tuple(Annotated[verb, tyro.conf.subcommand(verb.__name__)] for verb in verbs)]  # noqa: UP007
     # tyro has no public hook for parse errors. If a later version has no `_errors`, its errors are
     # printed in its own boxes.
     errors: Any = getattr(tyro, "_errors", None)
-    hook = errors and errors.on_parse_error(lambda event: _raise_parse_error(event, kind, program))
+    hook = errors and errors.on_parse_error(lambda event: _raise_parse_error(event, form, program))
     with hook or contextlib.nullcontext():
-        return cli(
-            kind,
+        verb: Verb = cli(
+            form,
             prog=program,
             description=description,
             args=words,
             compact_help=not {"-h", "-H", "--help-verbose"}.isdisjoint(words),
         )
+        return verb
 
 
-def _raise_parse_error(event: Any, kind: Any, program: str) -> None:
+def _raise_parse_error(event: ParseEvent, kind: Annotation, program: str) -> None:
     """Raise ValueError with one sentence for a parser error; tyro prints unknown kinds in a box."""
     match type(event).__name__:
         case "MissingSubcommand":
@@ -182,7 +199,7 @@ def _families_with(flag: str) -> list[str]:
     return [name for name, family in FAMILIES.items() if path in field_paths(family)]
 
 
-def _argument_name(argument: Any) -> str:
+def _argument_name(argument: ParseEvent) -> str:
     """Return the name of an argument for messages: its flag, or its name in capitals."""
     if argument.is_positional():
         return str(argument.field.intern_name.upper())
@@ -191,7 +208,7 @@ def _argument_name(argument: Any) -> str:
     return "/".join(name for name in argument.lowered.name_or_flags if not name.startswith("--no-"))
 
 
-def _expected_type(argument: Any) -> str:
+def _expected_type(argument: ParseEvent) -> str:
     """Return a description of the values that an argument takes."""
     kind = str(argument.lowered.metavar).replace("{None}|", "None or ")
     return kind.replace("INT", "a whole number").replace("FLOAT", "a number")

@@ -4,13 +4,15 @@ import dataclasses
 import datetime
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
+from rich.console import RenderableType
 from rich.text import Text
 
 from codrl_mj import compile_cache
-from codrl_mj.cli.parsing import AsJson
+from codrl_mj.boundary import Json
+from codrl_mj.cli.parsing import AsJson, Output
 from codrl_mj.cli.terminal import console, format_number, print_table, print_text
 from codrl_mj.runs import summaries
 from codrl_mj.runs.files import write_json
@@ -35,9 +37,9 @@ class Runs:
     """JSON file for the list or the comparison."""
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """List or compare runs."""
-        content: Any
+        content: dict[str, Json]
         if self.compare:
             comparison = summaries.compare(
                 [summaries.read_run(path, str(path)) for path in self.compare]
@@ -61,7 +63,7 @@ _RIGHT_COLUMNS = "seed", "steps", "state", "training\nreturn", "evaluated\nretur
 
 def _print_runs(runs: Sequence[RunSummary]) -> None:
     """Print a row for each run, and the problems of damaged runs."""
-    rows: list[Any] = []
+    rows: list[tuple[RenderableType, ...]] = []
     for run in runs:
         known = map(format_number, (run.task, run.agent, run.actuator, run.seed))
         returns = [

@@ -8,39 +8,19 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from codrl_mj.actuators import allow_imports
-from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, with_environment_flags
 from codrl_mj.cli.parsing import Trust
-from codrl_mj.cli.subject import Source, policy_and_environment
+from codrl_mj.cli.subject import EpisodeVerb, policy_and_environment
 from codrl_mj.cli.terminal import progress_bar
 from codrl_mj.envs.config import EnvConfig, is_source_name
+from codrl_mj.evaluation import Episode
 from codrl_mj.fields import did_you_mean
 from codrl_mj.runs import unique_names
-
-
-@dataclasses.dataclass(frozen=True)
-class EpisodeVerb:
-    """Common flags of the verbs that show an episode: policy, environment and seed."""
-
-    subject: Annotated[
-        tyro.conf.Positional[str],
-        tyro.conf.arg(
-            help=(
-                "Run folder, a folder with only a policy, or a Stable-Baselines3 zip (see"
-                " --trust); or a task name or an environment's id, for random actions."
-            )
-        ),
-    ]
-    source: tyro.conf.OmitArgPrefixes[Source] = Source()
-    actuator_name: ActuatorName = AS_TRAINED
-    seed: int = 0
-    """Seed of the episode; `view` uses it for the first episode."""
-
-    for_line = classmethod(with_environment_flags)
+from codrl_mj.runs.policies import Policy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +49,7 @@ class Render(EpisodeVerb):
     motor: str | None = None
     """Name of the motor whose torque and voltage are plotted; default: the first."""
 
-    def run(self: Any) -> int:
+    def run(self) -> int:
         """Run the episode and film it."""
         from codrl_mj.evaluation import save_episode
         from codrl_mj.viz.films.film import check_film, film, record
@@ -118,7 +98,7 @@ class Replay(EpisodeVerb):
     out: Path = Path("episode.html")
     """File to write."""
 
-    def run(self: Any) -> int:
+    def run(self) -> int:
         """Run the episode and write the page."""
         from codrl_mj.evaluation import run_episodes
         from codrl_mj.viz.replay import motion_of_episode, write_replay
@@ -134,7 +114,7 @@ class Replay(EpisodeVerb):
         return 0
 
 
-def _rank_text(verb: Any, env: Any, episode: Any) -> str:
+def _rank_text(verb: EpisodeVerb, env: EnvConfig, episode: Episode) -> str:
     """Return text that ranks an episode within the run's evaluation, in the same environment."""
     from codrl_mj.runs.summaries import describe_rank, read_evaluation
 
@@ -167,7 +147,7 @@ class LiveView(EpisodeVerb):
     native: bool = False
     """Use MuJoCo's own viewer instead of a browser; needs a display."""
 
-    def run(self: Any) -> int:
+    def run(self) -> int:
         """Serve until Ctrl-C."""
         from codrl_mj.training.run import collecting_signals
         from codrl_mj.viz.view.session import Session, run_native
@@ -211,22 +191,23 @@ class LiveView(EpisodeVerb):
             signal.raise_signal(signal.SIGINT)
         return 0
 
-    def _policies(self: Any, loaded_policy: Any, env: Any) -> dict[str, Callable[[], Any]]:
+    def _policies(self, loaded_policy: Policy, env: EnvConfig) -> dict[str, Callable[[], Policy]]:
         """Return name -> factory of a policy: last or best of this run, and those of other runs.
 
         A policy is loaded only when it is selected.
         """
-        factories: dict[str, Callable[[], Any]] = {}
+        factories: dict[str, Callable[[], Policy]] = {}
         subject = Path(self.subject)
         if not is_source_name(self.subject):
             factories[self.source.which] = lambda: loaded_policy
             if (subject / "best").is_dir():
+                alternative: Literal["last", "best"]
                 alternative = "best" if self.source.which == "last" else "last"
                 factories[alternative] = lambda: (
                     dataclasses.replace(self.source, which=alternative).load(subject).policy
                 )
 
-        def load_policy(run: Path) -> Any:
+        def load_policy(run: Path) -> Policy:
             loaded = self.source.load(run)
             loaded.check_interface(env)
             return loaded.policy

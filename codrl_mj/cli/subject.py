@@ -3,14 +3,20 @@
 import contextlib
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import tyro
 
-from codrl_mj.cli.environments import build_env_config
+from codrl_mj.cli.environments import (
+    AS_TRAINED,
+    ActuatorName,
+    EnvironmentVerb,
+    build_env_config,
+)
 from codrl_mj.envs.config import EnvConfig, check_time_limit, is_source_name
 from codrl_mj.fields import did_you_mean
-from codrl_mj.runs import CONFIG, finished
+from codrl_mj.runs import BEST, CONFIG, finished
+from codrl_mj.runs.policies import Policy
 from codrl_mj.tasks import TASKS
 
 
@@ -18,7 +24,7 @@ from codrl_mj.tasks import TASKS
 class Subject:
     """A policy, with the known facts about its training."""
 
-    policy: Any
+    policy: Policy
     """Policy that chooses the actions."""
     env: EnvConfig
     """Environment of its training; unknown settings have their defaults."""
@@ -89,7 +95,7 @@ class Source:
     def load(self, path: Path) -> Subject:
         """Load the policy of a run folder, of a policy folder, or of a Stable-Baselines3 zip."""
         from codrl_mj.runs.policies import load_policy, load_sb3_zip
-        from codrl_mj.training.folder import BEST, load_config, resume_command
+        from codrl_mj.training.folder import load_config, resume_command
 
         if self.normalize is not None and path.suffix != ".zip":
             raise ValueError(
@@ -133,7 +139,35 @@ class Source:
         return Subject(policy, EnvConfig(self.task), self.agent or type(policy).__name__)
 
 
-def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig, str]:
+@dataclasses.dataclass(frozen=True)
+class EpisodeVerb(EnvironmentVerb):
+    """Common flags of the verbs that show an episode: policy, environment and seed."""
+
+    subject: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(
+            help=(
+                "Run folder, a folder with only a policy, or a Stable-Baselines3 zip (see"
+                " --trust); or a task name or an environment's id, for random actions."
+            )
+        ),
+    ]
+    source: tyro.conf.OmitArgPrefixes[Source] = Source()
+    actuator_name: ActuatorName = AS_TRAINED
+    seed: int = 0
+    """Seed of the episode; `view` uses it for the first episode."""
+
+
+class ShownPolicy(NamedTuple):
+    """Policy that a verb shows, and where."""
+
+    policy: Policy
+    env: EnvConfig
+    title: str
+    """Name of the policy, and the actuator."""
+
+
+def policy_and_environment(verb: EpisodeVerb) -> ShownPolicy:
     """Return the policy, the environment and a title, from a verb's `subject` and flags.
 
     If the subject is a task or the id of an environment, the policy is random.
@@ -144,18 +178,17 @@ def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig, str]:
             f"no run configuration at {verb.subject}/{CONFIG}: {hint}It is neither a run"
             " folder nor a task"
         )
-    subject = (
-        Subject(None, EnvConfig(verb.subject), "")
-        if is_random
-        else verb.source.load(Path(verb.subject))
-    )
-    env = build_env_config(verb, subject.env.task, verb.actuator_name, subject.env)
+    subject = None if is_random else verb.source.load(Path(verb.subject))
+    trained_env = EnvConfig(verb.subject) if subject is None else subject.env
+    env = build_env_config(verb, trained_env.task, verb.actuator_name, trained_env)
     check_time_limit(env)
-    subject.check_interface(env)
-    policy = subject.policy
-    if is_random:
+    policy: Policy
+    if subject is None:
         from codrl_mj.evaluation import RandomPolicy
 
         with contextlib.closing(env.build()) as sample_env:
             policy = RandomPolicy(sample_env.action_space, verb.seed)
-    return policy, env, f"{Path(verb.subject).name} on {env.actuator_label}"
+    else:
+        subject.check_interface(env)
+        policy = subject.policy
+    return ShownPolicy(policy, env, f"{Path(verb.subject).name} on {env.actuator_label}")

@@ -8,10 +8,15 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from typing import Any
 
 from rich import box
-from rich.console import Console
+from rich.console import Console, JustifyMethod, RenderableType
 from rich.markup import escape
 from rich.table import Column, Table
 from rich.text import Text
+
+from codrl_mj.boundary import Argument
+
+Progress = Any
+"""Rich's `Progress`, which is imported only where one is shown."""
 
 
 def console() -> Console:
@@ -28,11 +33,11 @@ def print_text(*texts: str, style: str | None = None) -> None:
 def print_table(
     title: str,
     columns: Sequence[str],
-    rows: Iterable[Iterable[Any]],
+    rows: Iterable[Iterable[RenderableType]],
     right: Collection[str] = (),
     whole: Collection[str] = (),
     styles: Sequence[str] = (),
-    **table_options: Any,
+    **table_options: Argument,
 ) -> None:
     """Print a table; texts are printed as they are, without rich's markup.
 
@@ -45,14 +50,18 @@ def print_table(
         styles: rich style of each row.
         table_options: further options of `rich.table.Table`.
     """
-    defaults: dict[str, Any] = {"title_justify": "left", "box": box.SIMPLE_HEAD, "pad_edge": False}
+    defaults: dict[str, Argument] = {
+        "title_justify": "left",
+        "box": box.SIMPLE_HEAD,
+        "pad_edge": False,
+    }
     table = Table(
         title=escape(title) or None,
         row_styles=styles,
         **{**defaults, "padding": (0, 1, 0, 0), **table_options},
     )
     for name in columns:
-        justify: Any = "right" if name in right else "left"
+        justify: JustifyMethod = "right" if name in right else "left"
         table.add_column(
             escape(name),
             justify=justify,
@@ -64,7 +73,7 @@ def print_table(
     console().print(table)
 
 
-def format_number(value: Any, digits: int = 3) -> str:
+def format_number(value: object, digits: int = 3) -> str:
     """Format a number with some significant digits, and – for None or NaN.
 
     A tuple or mapping of a mean or median and its interval becomes "mean [low, high]". Numbers from
@@ -85,24 +94,17 @@ def format_number(value: Any, digits: int = 3) -> str:
     )
 
 
-def progress_bar(*columns: str) -> Any:
+def progress_bar(*columns: str) -> Progress:
     """Return a progress display with the given text columns, elapsed and remaining time.
 
     Each text is on one line, and empty while its numbers are unknown. If all do not fit on a line,
     the bar and the description are shortened. The display goes to standard error, and is disabled
     if that is not a terminal.
     """
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        Task,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich import progress
 
-    class Line(TextColumn):
-        def render(self, task: Task) -> Text:
+    class Line(progress.TextColumn):
+        def render(self, task: progress.Task) -> Text:
             text = super().render(task)
             # A total or a measure that is not known yet is formatted as None or nan. Hide the text
             # until then.
@@ -111,13 +113,13 @@ def progress_bar(*columns: str) -> Any:
             return text
 
     stderr_console = Console(stderr=True)
-    return Progress(
+    return progress.Progress(
         Line("{task.description}", table_column=Column()),
-        BarColumn(),
+        progress.BarColumn(),
         *(Line(column) for column in columns if column),
-        TimeElapsedColumn(table_column=Column(no_wrap=True)),
-        TextColumn("left"),
-        TimeRemainingColumn(table_column=Column(no_wrap=True)),
+        progress.TimeElapsedColumn(table_column=Column(no_wrap=True)),
+        progress.TextColumn("left"),
+        progress.TimeRemainingColumn(table_column=Column(no_wrap=True)),
         console=stderr_console,
         disable=not stderr_console.is_terminal,
     )

@@ -8,24 +8,28 @@ import re
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 from rich.console import Console
 
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
+from codrl_mj.boundary import Json
 from codrl_mj.cli.environments import (
     AS_CONFIGURED,
     FAMILY,
     ActuatorName,
+    EnvironmentFlags,
+    FlagField,
+    Flags,
     build_env_config,
     environment_fields,
     flag_dataclass,
     parse_options,
     scan_flags,
 )
-from codrl_mj.cli.parsing import AsJson
+from codrl_mj.cli.parsing import Annotation, AsJson, Output
 from codrl_mj.cli.terminal import print_text, progress_bar
 from codrl_mj.envs.config import find_source
 from codrl_mj.fields import command
@@ -41,7 +45,7 @@ from codrl_mj.training.history import REPORT_COLUMNS
 _SEPARATE_FIELDS = ("agent", "env")
 
 
-def train_verb(arguments: list[str]) -> Any:
+def train_verb(arguments: list[str]) -> type["Train"]:
     """Return the verb's dataclass for a command line.
 
     Agent, task, settings and files on the line determine the flags and their defaults.
@@ -59,11 +63,11 @@ def train_verb(arguments: list[str]) -> Any:
     agent_flags = flag_dataclass(type(base.agent), base.agent)
     train_flags = flag_dataclass(TrainConfig, base, _SEPARATE_FIELDS)
     task_known = has_config or chosen.task is not None
-    tasks: Any = Literal[tuple(dict.fromkeys([*TASKS, base.task, chosen.task or base.task]))]
-    agents: Any = Literal[tuple(dict.fromkeys([*AGENTS, base.agent.registry_name()]))]
-    positional: Any = tyro.conf.Positional
+    tasks: Annotation = Literal[tuple(dict.fromkeys([*TASKS, base.task, chosen.task or base.task]))]
+    agents: Annotation = Literal[tuple(dict.fromkeys([*AGENTS, base.agent.registry_name()]))]
+    positional: Annotation = tyro.conf.Positional
     task = "task", Annotated[positional[tasks], tyro.conf.arg(help="Task to learn.")]
-    fields: list[Any] = [
+    fields: list[FlagField] = [
         (*task, base.task) if task_known else task,
         (
             "agent_name",
@@ -82,7 +86,7 @@ def train_verb(arguments: list[str]) -> Any:
         (
             "settings",
             Annotated[
-                Literal[SETTINGS],  # type: ignore[valid-type]
+                Literal[SETTINGS],
                 tyro.conf.arg(
                     help=(
                         "Source of the defaults: `default` (ours), `paper` (as printed),"
@@ -106,7 +110,7 @@ def train_verb(arguments: list[str]) -> Any:
         ),
         *environment_fields(base.env, chosen, base.task),
     ]
-    verb: Any = dataclasses.make_dataclass(
+    verb: type[Train] = dataclasses.make_dataclass(
         "Train", fields, bases=(Train,), frozen=True, kw_only=True
     )
     verb.__doc__ = Train.__doc__
@@ -114,8 +118,20 @@ def train_verb(arguments: list[str]) -> Any:
     return verb
 
 
+class _TrainingVerb(EnvironmentFlags):
+    """Verb with flags for a training; `train_verb` adds their fields."""
+
+    task: str
+    actuator_name: str
+    """Name of an actuator, or `AS_CONFIGURED`."""
+    agent: Flags
+    """Settings of the agent."""
+    base: ClassVar[TrainConfig]
+    """Configuration that gives the flags their defaults."""
+
+
 @dataclasses.dataclass(frozen=True)
-class Train:
+class Train(_TrainingVerb):
     """Train an agent through an actuator, and write a run folder.
 
     The folder gets the resolved configuration, tables of episodes and progress, checkpoints, the
@@ -152,7 +168,7 @@ class Train:
     as_json: AsJson = False
     for_line = staticmethod(train_verb)
 
-    def run(self: Any) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Train with a progress bar."""
         from codrl_mj.training import train
 
@@ -216,7 +232,7 @@ def _next_command(run: Path) -> str:
     return f"next: {command('evaluate', run, trust=needs_trust(run))}"
 
 
-def _result_mapping(run: Path) -> dict[str, Any]:
+def _result_mapping(run: Path) -> dict[str, Json]:
     """Return the result of a finished run, with units, for --json."""
     units = {
         "mean_return": "reward",
@@ -254,7 +270,7 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
                 else ("steps", config.total_steps)
             )
             # Columns of NaN stay hidden until the first report (see `progress_bar`).
-            no_report: dict[str, Any] = dict.fromkeys(REPORT_COLUMNS, math.nan)
+            no_report: dict[str, float] = dict.fromkeys(REPORT_COLUMNS, math.nan)
             rows[bar.add_task(name, total=total, unit=unit, **no_report)] = (
                 folder / PROGRESS,
                 unit,
@@ -264,7 +280,7 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
         def show() -> None:
             for row, (file, unit, total) in rows.items():
                 for last in read_progress(file, [])[-1:]:
-                    report: dict[str, Any] = {name: float(value) for name, value in last.items()}
+                    report: dict[str, float] = {name: float(value) for name, value in last.items()}
                     bar.update(row, completed=min(int(report[unit]), total), **report)
 
         finished = threading.Event()

@@ -3,13 +3,15 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from rich import box
+from rich.console import RenderableType
 from rich.text import Text
 
-from codrl_mj.cli.parsing import AsJson
+from codrl_mj.boundary import Argument
+from codrl_mj.cli.parsing import AsJson, Output
 from codrl_mj.cli.terminal import console, print_table, print_text, progress_bar
 from codrl_mj.tasks import TASKS
 from codrl_mj.validation import GROUPS, Certificate, Check, MutationResult
@@ -45,7 +47,7 @@ class Validate:
     """Folder for the certificate: certificate.json, and certificate.html with plots."""
     as_json: AsJson = False
 
-    def run(self) -> tuple[int, Any]:
+    def run(self) -> Output:
         """Validate and print a table for each group."""
         from codrl_mj.validation import own_model, try_mutations, validate, validate_model
         from codrl_mj.validation.mutations import as_mapping, mutation_tasks, undetected_checks
@@ -82,13 +84,13 @@ class Validate:
         return int(bool(failed)), certificate.as_mapping() | as_mapping(certificate, results)
 
 
-_FRAMED: dict[str, Any] = {"box": box.HEAVY_HEAD, "pad_edge": True, "padding": (0, 1)}
+_FRAMED: dict[str, Argument] = {"box": box.HEAVY_HEAD, "pad_edge": True, "padding": (0, 1)}
 
 
 def print_checks(checks: Sequence[Check], title: str = "MuJoCo against Gymnasium") -> None:
     """Print one table with a row for each check, and below it the details of failed checks."""
     columns = "check", "samples", "worst", "allowed", "margin", "unit", "verdict"
-    rows: list[Any] = []
+    rows: list[tuple[RenderableType, ...]] = []
     for check in checks:
         numbers = f"{check.samples:,}", f"{check.worst:.1e}", f"{check.tolerance:.0e}", check.margin
         verdict = Text("passed", "green") if check.passed else Text("FAILED", "red")
@@ -126,10 +128,10 @@ def print_certificate(certificate: Certificate) -> None:
 def print_mutations(results: Sequence[MutationResult], never_failed: Sequence[Check]) -> None:
     """Print one table with a row for each injected fault, and the checks that no fault fails."""
     columns = "fault", "in", "failed", "clearest check", "worst", "allowed", "beyond"
-    rows: list[Any] = []
+    rows: list[tuple[RenderableType, ...]] = []
     for outcome in results:
         check = outcome.clearest_failure
-        shown: list[Any] = [Text("MISSED", "red"), "", "", ""]
+        shown: list[RenderableType] = [Text("MISSED", "red"), "", "", ""]
         if check is not None:
             numbers = f"{check.worst:.1e}", f"{check.tolerance:.0e}", f"{check.tolerance_ratio:.1e}"
             shown = [f"{check.group}: {check.name}", *numbers]

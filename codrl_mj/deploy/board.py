@@ -11,10 +11,11 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
 
+from codrl_mj.actuators import DCMotorActuator, Drive
 from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.wire import BEYOND, REFUSED, Wire
 from codrl_mj.envs.config import EnvConfig
@@ -74,7 +75,7 @@ class OnnxPolicy:
         observation: np.ndarray,
         *,
         deterministic: bool = True,  # noqa: ARG002 - required by the Policy protocol
-    ) -> tuple[np.ndarray, Any]:
+    ) -> tuple[np.ndarray, None]:
         """Return actions (N, m) or (N,) for observations (N, k)."""
         actions = self.session.run(None, {"observation": observation.astype(np.float32)})[0]
         is_beyond = ~self.contract.is_within_limits(observation)
@@ -143,7 +144,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
         link: Link | None = None,
         seed: int = 0,
         loop: bool = True,
-        actuator: Any = None,
+        actuator: object = None,
         trust: bool = False,
     ) -> None:
         """Compile and start the C code.
@@ -184,7 +185,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
                 actuator=dict.fromkeys(self.env.actuators_by_name, actuator),
                 randomize=None,
             )
-        motor: Any = self.env.actuators[0]
+        motor = self.env.actuators[0]
         if self.loop is not None and type(motor) is not trained:
             raise ValueError(
                 f"actuator: a {type(motor).__name__}, must be a {trained.__name__}, for which the C"
@@ -201,14 +202,17 @@ class Board(contextlib.AbstractContextManager["Board"]):
         steps = self._converters()
         with contextlib.ExitStack() as stack:
             process = stack.enter_context(_running(folder, target))
+            assert process.stdin is not None
+            assert process.stdout is not None
             self._wire = Wire(self.contract, process.stdin.fileno(), process.stdout.fileno())
             self._samples = np.zeros(2)
             if self.loop is not None:
                 # The import compiles with numba and is only needed if the C code closes the loop.
                 from codrl_mj.deploy.on_board import loop_on_board
 
+                looped = cast(Drive | DCMotorActuator, motor)
                 amperes = (
-                    motor.arm_radius / motor.motor.torque_constant
+                    looped.arm_radius / looped.motor.torque_constant
                     if self.env.action == "force"
                     else 1.0
                 )
@@ -251,7 +255,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
         observation: np.ndarray,
         *,
         deterministic: bool = True,  # noqa: ARG002 - required by the Policy protocol
-    ) -> tuple[np.ndarray, Any]:
+    ) -> tuple[np.ndarray, None]:
         """Return actions (N, m) or (N,) for observations (N, k), each sent in a separate frame."""
         if self._samples[1]:
             raise RuntimeError(f"the board's current loop did not answer at sample {self.samples}")
@@ -387,7 +391,7 @@ def board_test(
     seed: int = 0,
     link: Link | None = None,
     loop: bool = True,
-    actuator: Any = None,
+    actuator: object = None,
     on_episode: Callable[[int], None] = lambda _: None,
     trust: bool = False,
 ) -> BoardTest:
@@ -443,7 +447,7 @@ def instructions(folder: Path) -> tuple[int, int]:
 
 
 @contextlib.contextmanager
-def _running(folder: Path, target: str, define: str = "") -> Iterator[Any]:
+def _running(folder: Path, target: str, define: str = "") -> Iterator[subprocess.Popen[bytes]]:
     """Compile the program of a folder and run it with pipes during a `with` block."""
     with tempfile.TemporaryDirectory() as build_folder:
         command = _build(folder, target, Path(build_folder), [f"-D{define}"] if define else [])

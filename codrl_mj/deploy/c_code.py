@@ -4,9 +4,9 @@ The code allocates no memory and uses only tanh, atan2 and fabs of the C library
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 import codrl_mj
 from codrl_mj.deploy.contract import Contract
@@ -53,7 +53,7 @@ def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
         text = repr(float(value)) if double else f"{float(np.float32(value)):.9g}"
         return (text if set(text) & set(".en") else f"{text}.0") + suffix
 
-    def array(values: Any, format_value: Callable[[float], str] = number) -> str:
+    def array(values: ArrayLike, format_value: Callable[[float], str] = number) -> str:
         return "{" + ", ".join(format_value(value) for value in np.ravel(values).tolist()) + "}"
 
     golden = contract.golden

@@ -3,13 +3,15 @@
 import contextlib
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
 
 from codrl_mj.deploy.contract import Interface
 from codrl_mj.deploy.log import read_rows
+from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.tasks import Task
 
 WINDOW, MIN_ROWS = 0.5, 10
 """Default duration [s] and smallest number of rows of a window.
@@ -40,7 +42,8 @@ class RigComparison:
     @property
     def errors(self) -> np.ndarray:
         """Root mean square of simulated minus logged, over all windows, shape (k,)."""
-        return np.sqrt(((self.simulated - self.logged) ** 2).mean(axis=0))
+        errors: np.ndarray = np.sqrt(((self.simulated - self.logged) ** 2).mean(axis=0))
+        return errors
 
     @property
     def baseline_errors(self) -> np.ndarray:
@@ -48,11 +51,12 @@ class RigComparison:
         held = self.logged[
             self.starts[np.searchsorted(self.starts, np.arange(len(self.time)), "right") - 1]
         ]
-        return np.sqrt(((held - self.logged) ** 2).mean(axis=0))
+        errors: np.ndarray = np.sqrt(((held - self.logged) ** 2).mean(axis=0))
+        return errors
 
 
 def compare(
-    env: EnvConfig, path: Path, window: float | None = None, actuator: Any = None
+    env: EnvConfig, path: Path, window: float | None = None, actuator: object = None
 ) -> RigComparison:
     """Simulate the commands of a log and compare the observations with those in the log.
 
@@ -114,7 +118,7 @@ def compare(
             )
     simulated, actions = [], interface.to_actions(commands)
     with contextlib.closing(simulated_env.build()) as wrapped:
-        simulation: Any = wrapped.unwrapped
+        simulation = cast(ActuatedEnv, wrapped.unwrapped)
         if (task := getattr(simulation, "task", None)) is None:
             raise ValueError(
                 f"{interface.task}: only a task's state can be set to an observed one: must be a"
@@ -127,11 +131,12 @@ def compare(
                 observation = observed[row]
             simulated.append(observation)
             observation = simulation.step(action)[0]
-    names, units = ([entry[key] for entry in interface.observations] for key in ("name", "unit"))
+    names = [entry["name"] for entry in interface.observations]
+    units = [entry["unit"] for entry in interface.observations]
     return RigComparison(names, units, time, observed, np.array(simulated), starts)
 
 
-def _state_of(task: Any, observed: np.ndarray, near: np.ndarray) -> np.ndarray:
+def _state_of(task: Task, observed: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Return the task's state that gives an observation; the search starts at the state `near`."""
     from scipy.optimize import least_squares
 
@@ -139,7 +144,8 @@ def _state_of(task: Any, observed: np.ndarray, near: np.ndarray) -> np.ndarray:
     target = observed[: len(task.observation_names)]
 
     def residual(state: np.ndarray) -> np.ndarray:
-        return np.array(task.observation(tuple(state)), dtype=float) - target
+        difference: np.ndarray = np.array(task.observation(tuple(state)), dtype=float) - target
+        return difference
 
     random, fit = np.random.default_rng(0), least_squares(residual, near)
     # The search may end in a local minimum of an angle, so it is repeated from other states.

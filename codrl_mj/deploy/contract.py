@@ -14,15 +14,16 @@ import json
 import platform
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 
-from codrl_mj.actuators import allow_imports, mapping_of
+from codrl_mj.actuators import ActuatorModel, allow_imports, mapping_of
+from codrl_mj.boundary import JsonObject
 from codrl_mj.deploy.loops import loop_parameters
 from codrl_mj.deploy.network import extract_network
-from codrl_mj.deploy.spaces import describe_spaces
-from codrl_mj.envs.config import EnvConfig
+from codrl_mj.deploy.spaces import Entries, describe_spaces
+from codrl_mj.envs.config import Env, EnvConfig
 from codrl_mj.evaluation import run_episodes
 from codrl_mj.fields import check_names, did_you_mean, differences
 from codrl_mj.runs.files import read_json, with_digest, write_json
@@ -39,7 +40,7 @@ LATE_PERIODS = 1.5
 _PACKAGES = ("codrl-mj", "mujoco", "gymnasium", "numpy", "stable-baselines3", "torch")
 
 
-def _step_duration(env: Any) -> float:
+def _step_duration(env: Env) -> float:
     """Return the simulated time between two actions [s].
 
     A task's environment stores the duration. For other environments it is measured, because their
@@ -48,7 +49,8 @@ def _step_duration(env: Any) -> float:
     recorder = env.get_wrapper_attr("recorder")
     actions = copy.deepcopy(env.action_space)
     durations = list[float]()
-    if recorder is env.unwrapped:
+    is_task = recorder is env.unwrapped
+    if is_task:
         return float(recorder.step_duration)
     actions.seed(0)
     env.reset(seed=0)
@@ -75,15 +77,10 @@ class Interface:
     """Name of the environment."""
     rate: float
     """Actions per second [Hz]."""
-    observations: list[dict[str, Any]]
-    """Entries of an observation, in order: `name`, `unit` and the bounds `least` and `most`.
-
-    In a contract, each entry also has `scale` and `offset`, by which the policy itself transforms
-    the entry before its first layer, and `seen`, the smallest and the largest value in the golden
-    episodes.
-    """
-    actions: list[dict[str, Any]]
-    """Entries of an action in the same form; a discrete action has the `levels` of its indices."""
+    observations: Entries
+    """Entries of an observation, in order."""
+    actions: Entries
+    """Entries of an action, in order."""
 
     @classmethod
     def from_env(cls, env: EnvConfig) -> "Interface":
@@ -114,7 +111,8 @@ class Interface:
                 if "least" in self.actions[0]
                 else commands[:, 0].round().astype(int)
             )
-        return np.abs(commands[:, None, :] - levels).sum(axis=2).argmin(axis=1)
+        nearest: np.ndarray = np.abs(commands[:, None, :] - levels).sum(axis=2).argmin(axis=1)
+        return nearest
 
     def check_observations(
         self, observations: Sequence[tuple[str, str | None]], rate: float | None = None
@@ -158,24 +156,64 @@ class Interface:
             )
 
 
+class RecordedActuator(TypedDict):
+    """Actuator of a motor in the training."""
+
+    fields: JsonObject | None
+    """Fields of the actuator; None if it is ideal."""
+    sha256: str
+    """Digest of the fields."""
+
+
+class Controller(TypedDict):
+    """Properties of the C code."""
+
+    real: str
+    """Number type, `float` or `double`."""
+    loop: JsonObject | None
+    """Parameters of the current loop, see `loop_parameters`; None if the code closes none."""
+
+
+class Late(TypedDict):
+    """Reaction to a late observation or command."""
+
+    after: float
+    """Time after which it is late."""
+    unit: str
+    """Unit of the time."""
+    command: list[float]
+    """Safe command that is used then."""
+
+
+class Golden(TypedDict):
+    """Golden observations of a policy and its actions."""
+
+    observations: list[list[float]]
+    """Observations, shape (n, k)."""
+    actions: list[list[float]] | list[int]
+    """The policy's actions, shape (n, m), or indices (n,)."""
+    tolerance: float
+    """Largest error of another runtime's commands."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Contract(Interface):
     """Contents of the contract file."""
 
     agent: str
     """Name of the trained agent."""
-    actuators: dict[str, dict[str, Any]]
-    """Motor name or pattern -> `fields` of the actuator (None if ideal) and their `sha256`."""
-    assumed: dict[str, Any]
+    actuators: dict[str, RecordedActuator]
+    """Motor name or pattern -> its actuator."""
+    assumed: JsonObject
     """Environment of the training, as a mapping for `EnvConfig.from_mapping`."""
-    controller: dict[str, Any]
-    """Number type of the C code, `real`, and the parameters of the current `loop`, or None."""
+    controller: Controller
+    """Number type and current loop of the C code."""
     limits: dict[str, list[float | None]]
     """Observation -> smallest and largest safe value; beyond them the safe command is used."""
-    late: dict[str, Any]
-    """Time `after` which an observation or command is late, and the safe `command` to use then."""
-    golden: dict[str, Any]
-    """Golden `observations` (n, k), the policy's `actions` (n, m) or (n,), and a `tolerance`."""
+    late: Late
+    """Reaction to a late observation or command."""
+    golden: Golden
+    """Golden values, to test other runtimes."""
     versions: dict[str, str]
     """Versions of the software that wrote the contract."""
 
@@ -289,7 +327,7 @@ class Contract(Interface):
 
     def is_within_limits(self, observations: np.ndarray) -> np.ndarray:
         """Return True for observations (N, k) that are finite and within the limits, shape (N,)."""
-        is_safe = np.isfinite(observations).all(axis=1)
+        is_safe: np.ndarray = np.isfinite(observations).all(axis=1)
         for index, entry in enumerate(self.observations):
             lower, upper = self.limits.get(entry["name"], (None, None))
             is_safe &= (lower is None or observations[:, index] >= lower) & (
@@ -297,7 +335,7 @@ class Contract(Interface):
             )
         return is_safe
 
-    def check_actuators(self, actuators: Mapping[str, Any]) -> None:
+    def check_actuators(self, actuators: Mapping[str, ActuatorModel]) -> None:
         """Raise an error if actuators are not those of the training.
 
         Args:
@@ -346,7 +384,7 @@ def _limits(names: list[str], limits: Mapping[str, float]) -> dict[str, list[flo
     }
 
 
-def _with_digest(fields: Mapping[str, Any] | None) -> dict[str, Any]:
+def _with_digest(fields: JsonObject | None) -> RecordedActuator:
     """Return fields with their digest."""
     digest = hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
     return {"fields": fields, "sha256": digest}

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from codrl_mj.boundary import Json, JsonObject
 from codrl_mj.deploy.c_code import c_files, check_board
 from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.network import Network, extract_network
@@ -15,6 +16,9 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.files import atomic_folder
 from codrl_mj.runs.policies import Policy
 
+# onnx is optional, and mypy does not read it.
+OnnxMessage = Any
+"""Message of `onnx`, such as its `ModelProto`, a node or a constant."""
 ONNX, TABLE = "policy.onnx", "table.csv"
 OPSET = 17
 """Version of the ONNX operators."""
@@ -22,7 +26,7 @@ IR = 9
 """Version of the ONNX file format, which onnxruntime 1.16 and later read."""
 
 
-def onnx_model(network: Network | Tiles, metadata: Mapping[str, Any]) -> Any:
+def onnx_model(network: Network | Tiles, metadata: Mapping[str, Json]) -> OnnxMessage:
     """Return the ONNX model from `observation`, float32 (N, k), to `action`.
 
     The action is float32 (N, m), or int64 (N,) for discrete actions.
@@ -38,10 +42,10 @@ def onnx_model(network: Network | Tiles, metadata: Mapping[str, Any]) -> Any:
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-    constants: list[Any] = []
-    nodes: list[Any] = []
+    constants: list[OnnxMessage] = []
+    nodes: list[OnnxMessage] = []
 
-    def node(kind: str, *inputs: str | np.ndarray, **attributes: Any) -> str:
+    def node(kind: str, *inputs: str | np.ndarray, **attributes: int) -> str:
         """Add a node with inputs by name or as constants, and return the name of its output."""
         names = []
         for operand in inputs:
@@ -129,7 +133,7 @@ def export(
     if board is not None:
         check_board(board, network, double)
     contract = Contract.from_policy(policy, env, agent, episodes, seed, limits, double)
-    metadata: dict[str, Any] = {
+    metadata: JsonObject = {
         name: getattr(contract, name)
         for name in ("task", "agent", "rate", "observations", "actions", "versions")
     }

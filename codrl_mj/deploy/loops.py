@@ -4,23 +4,24 @@ The loops are the current loops of a drive and of the paper's actuator, and the 
 """
 
 import contextlib
-from typing import Any
+from typing import cast
 
 import numpy as np
 
 from codrl_mj.actuators import DCMotorActuator, Drive, Servo, sampled
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
+from codrl_mj.boundary import JsonObject
 from codrl_mj.envs.config import EnvConfig
 
 
-def loop_parameters(env: EnvConfig) -> dict[str, Any] | None:
+def loop_parameters(env: EnvConfig) -> JsonObject | None:
     """Return the parameters of the loop that all motors share; None if a board cannot close it.
 
     The actuators must be a `codrl_mj.actuators.Drive`, a `Servo`, or the paper's `DCMotorActuator`.
     Gains that are designed from the winding are those at 25 degC. The parameters are the current
     for a command of 1, limits [A] and [V], gains, and the sample rate [Hz].
     """
-    first: Any = env.actuators[0]
+    first = env.actuators[0]
     actions = ("position", "velocity") if type(first) is Servo else ("force", "current")
     # A subclass may have another loop, so the types must be equal.
     if type(first) not in (Drive, Servo, DCMotorActuator) or any(
@@ -29,25 +30,28 @@ def loop_parameters(env: EnvConfig) -> dict[str, Any] | None:
         return None
     if env.action not in actions:
         return None
-    motor, loop = first.motor, first.controller
+    looped = cast(Drive | DCMotorActuator, first)
+    motor = looped.motor
     commands_force = env.action == "force"
     shared = {
         "unit": "N or N*m" if commands_force else "A",
-        "amperes": first.arm_radius / motor.torque_constant if commands_force else 1.0,
+        "amperes": looped.arm_radius / motor.torque_constant if commands_force else 1.0,
         "most": None,
         # An infinite limit could not be written as a constant in C.
-        "voltage": min(first.voltage_limit, 1e30),
+        "voltage": min(looped.voltage_limit, 1e30),
         "servo": None,
     }
-    if type(first) is DCMotorActuator:
+    if isinstance(looped, DCMotorActuator):
         # The paper's loop is sampled at the engine's step, which only the model knows.
         with contextlib.closing(env.build()) as instance:
             model = getattr(instance.unwrapped, "model", None)
         return (
             None
             if model is None
-            else shared | _paper_loop(first, float(model.opt.timestep) / loop.substeps)
+            else shared
+            | _paper_loop(looped, float(model.opt.timestep) / looped.controller.substeps)
         )
+    loop = looped.controller
     # Gains of zero stand for gains that are designed from the bandwidth.
     kp, ki = loop.kp, loop.ki / loop.sample_rate
     if loop.kp == 0.0 and loop.ki == 0.0:
@@ -57,7 +61,7 @@ def loop_parameters(env: EnvConfig) -> dict[str, Any] | None:
         )
     return shared | {
         "kind": "sampled",
-        "sag": first.supply_resistance,
+        "sag": looped.supply_resistance,
         "rate": loop.sample_rate,
         "most": loop.max_current if np.isfinite(loop.max_current) else None,
         "kp": kp,
@@ -66,11 +70,11 @@ def loop_parameters(env: EnvConfig) -> dict[str, Any] | None:
         "back_emf": motor.back_emf_constant if loop.bemf_compensation else 0.0,
         "anti_windup": loop.anti_windup,
         "delayed": loop.delayed,
-        "servo": _outer_loops(first) if type(first) is Servo else None,
+        "servo": _outer_loops(looped) if isinstance(looped, Servo) else None,
     }
 
 
-def _paper_loop(actuator: DCMotorActuator, period: float) -> dict[str, Any]:
+def _paper_loop(actuator: DCMotorActuator, period: float) -> JsonObject:
     """Return the parameters of `actuators.electrical_step` at a period [s].
 
     A limit of None means that there is no limit.
@@ -92,7 +96,7 @@ def _paper_loop(actuator: DCMotorActuator, period: float) -> dict[str, Any]:
     }
 
 
-def _outer_loops(servo: Servo) -> dict[str, Any]:
+def _outer_loops(servo: Servo) -> JsonObject:
     """Return the parameters of a servo's position and velocity loops, referred to the rotor.
 
     They are those of `codrl_mj.actuators.servo.demand`. A limit of None means that there is no

@@ -11,9 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.deploy.tiles import Tiles
+from codrl_mj.deploy.spaces import Entry
+from codrl_mj.deploy.tiles import AddNode, Float, Tiles
 from codrl_mj.runs.policies import NormalizedPolicy, Policy
 
+# torch and Stable-Baselines3 take seconds to import, and their policies have different attributes.
+Module = Any
+"""A `torch.nn.Module`, such as a layer or a Stable-Baselines3 policy."""
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "Tanh": np.tanh,
     "ReLU": lambda values: np.maximum(values, 0.0),
@@ -70,7 +74,7 @@ class Network:
     normalization: Normalization | None = None
     """Statistics that normalize the observation; None for no normalization."""
 
-    def add_to_graph(self, node: Any) -> str:
+    def add_to_graph(self, node: AddNode) -> str:
         """Add the policy's nodes to an ONNX graph and return the name of the output.
 
         Args:
@@ -97,9 +101,9 @@ class Network:
         )
         return str(node("Add", node("Mul", share, self.high - self.low), self.low))
 
-    def __call__(self, observations: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, dtype: Float = np.float32) -> np.ndarray:
         """Return actions (N, m) or indices (N,) for observations (N, k), computed in `dtype`."""
-        values = observations
+        values: np.ndarray = observations
         if (norm := self.normalization) is not None:
             values = np.clip((values - norm.mean) / norm.std, -norm.clip, norm.clip)
         values = values.astype(dtype) * self.factors.astype(dtype)
@@ -109,13 +113,16 @@ class Network:
             )
         values = values * self.gains.astype(dtype)
         if self.low is None or self.high is None:
-            return values.argmax(axis=1)
-        low, high = self.low.astype(dtype), self.high.astype(dtype)
-        return (
+            indices: np.ndarray = values.argmax(axis=1)
+            return indices
+        low: np.ndarray = self.low.astype(dtype)
+        high: np.ndarray = self.high.astype(dtype)
+        actions: np.ndarray = (
             low + dtype(0.5) * (values + dtype(1.0)) * (high - low)
             if self.squashed
             else np.clip(values, low, high)
         )
+        return actions
 
     @property
     def width(self) -> int:
@@ -139,13 +146,13 @@ class Network:
         statistics = 0 if self.normalization is None else 2 * len(self.normalization.mean)
         return statistics + sum(layer.weight.size + layer.bias.size for layer in self.layers)
 
-    def input_scaling(self, index: int) -> dict[str, float | None]:
+    def input_scaling(self, index: int) -> Entry:
         """Return the scaling of an observation entry before the first layer, for the contract."""
         factor, norm = float(self.factors[index]), self.normalization
         if norm is None:
             return {"scale": factor, "offset": 0.0}
         mean, std = float(norm.mean[index]), float(norm.std[index])
-        statistics = {
+        statistics: Entry = {
             "mean": mean,
             "variance": std**2,
             "clip": norm.clip if np.isfinite(norm.clip) else None,
@@ -185,8 +192,7 @@ def extract_network(policy: Policy) -> Network | Tiles:
     from stable_baselines3.sac.policies import SACPolicy
     from stable_baselines3.td3.policies import TD3Policy
 
-    # The attributes differ from class to class, hence Any.
-    model: Any = policy
+    model: Module = policy
     squashed = isinstance(model, SACPolicy | TD3Policy)
     if isinstance(model, ActorCriticPolicy) and not model.squash_output:
         extractor = model.pi_features_extractor
@@ -221,7 +227,7 @@ def extract_network(policy: Policy) -> Network | Tiles:
     )
 
 
-def _layers(modules: list[Any]) -> list[Layer]:
+def _layers(modules: list[Module]) -> list[Layer]:
     """Return the dense layers of a list of modules, with the activations that follow them."""
     layers: list[Layer] = []
     for module in modules:

@@ -9,17 +9,19 @@ and returned, because the engine may evaluate a step twice.
 import contextlib
 import ctypes
 import math
-from collections.abc import Iterator
+import subprocess
+from collections.abc import Callable, Iterator
 from types import FunctionType, ModuleType
-from typing import Any
+from typing import cast
 
 import numpy as np
 from numba import types
 
 from codrl_mj.actuators import DCMotorActuator, Drive, Servo, current_loop, drive, servo, shaft
 from codrl_mj.actuators.model import Family
+from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.shaft import Winding
-from codrl_mj.compile_cache import external_function
+from codrl_mj.compile_cache import P, R, external_function
 from codrl_mj.engine.families import family_replaced
 from codrl_mj.engine.memory import entry_address, f64, named_address, u64
 
@@ -33,7 +35,7 @@ _TABLE = np.zeros(32)
 _table_address = named_address("codrl_mj_board", _TABLE.ctypes.data)
 _WRITE_FD, _AMPERES, _CURRENT_STEP, _VOLTAGE_STEP, _SAMPLES, _LOST = 0, 2, 3, 4, 5, 6
 # The C library of this process, whose functions compiled code can call.
-_C: Any = ctypes.CDLL(None)
+_C = ctypes.CDLL(None)
 _size = types.uintp
 _write = external_function("codrl_mj_board_write", _C.write, types.int64(types.int32, _size, _size))
 _read = external_function("codrl_mj_board_read", _C.read, types.int64(types.int32, _size, _size))
@@ -90,7 +92,7 @@ def sample_on_board(
 
 
 def advance_winding(
-    parameters: Any,
+    parameters: Parameters,
     resistance: float,
     samples: int,
     winding: Winding,
@@ -142,7 +144,7 @@ def advance_winding(
 
 
 def electrical_step(
-    parameters: Any,
+    parameters: Parameters,
     dt: float,
     current: float,
     integral: float,
@@ -169,13 +171,17 @@ def electrical_step(
     return current, integral, error, voltage
 
 
-def _replace_globals(function: Any, **replacements: Any) -> Any:
+def _replace_globals(function: Callable[P, R], **replacements: object) -> Callable[P, R]:
     """Return a copy of a function with some of its globals replaced."""
+    # The families' own source must run here, step for step, with only the electrical step replaced.
+    # A second implementation would have to be kept equal, an argument for the step would cost every
+    # simulation time, and replacing the module's own name would change other threads' motors.
+    original = cast(FunctionType, function)
     return FunctionType(
-        function.__code__,
-        {**function.__globals__, **replacements},
-        function.__name__,
-        function.__defaults__,
+        original.__code__,
+        {**original.__globals__, **replacements},
+        original.__name__,
+        original.__defaults__,
     )
 
 
@@ -185,7 +191,7 @@ vars(_shaft).update(
     vars(shaft),
     advance_motor=_replace_globals(shaft.advance_motor, advance_winding=advance_winding),
 )
-_ADVANCE = {
+_ADVANCE: dict[Family, Callable[..., object]] = {
     Drive: _replace_globals(drive.advance, _advance=_replace_globals(drive._advance, shaft=_shaft)),
     Servo: _replace_globals(servo.advance, shaft=_shaft),
     DCMotorActuator: _replace_globals(current_loop.advance, electrical_step=electrical_step),
@@ -195,7 +201,7 @@ _ADVANCE = {
 @contextlib.contextmanager
 def loop_on_board(
     family: Family,
-    process: Any,
+    process: subprocess.Popen[bytes],
     amperes: float,
     current_step: float = 0.0,
     voltage_step: float = 0.0,
@@ -215,6 +221,8 @@ def loop_on_board(
     board_family = type(
         family.__name__, (family,), {"advance": staticmethod(_ADVANCE[family]), "family": ""}
     )
+    assert process.stdin is not None
+    assert process.stdout is not None
     _TABLE[:] = 0.0
     _TABLE[[_WRITE_FD, _AMPERES, _CURRENT_STEP, _VOLTAGE_STEP]] = (
         process.stdin.fileno(),

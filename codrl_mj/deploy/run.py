@@ -4,7 +4,7 @@ import contextlib
 import csv
 import math
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +26,9 @@ from codrl_mj.deploy.wire import (
 )
 from codrl_mj.runs.files import atomic_write
 
+# pyserial is optional, and is imported where a port is opened.
+SerialPort = Any
+"""A `serial.Serial`."""
 MAX_MISSED = 3
 """Number of consecutive frames without an answer that ends a run which drives the motor."""
 
@@ -146,9 +149,8 @@ def _exchange_frames(
         wire.request(wire.frame(sequence + 1, stamp, zeros, WATCH), sequence + 1, timeout)
 
 
-def _open_port(port: str, baud: int) -> Any:
+def _open_port(port: str, baud: int) -> SerialPort:
     """Open the serial port."""
-    # pyserial is optional.
     import serial
 
     try:
@@ -184,11 +186,14 @@ def _stop_reason(contract: Contract, answer: Answer | None, num_consecutive: int
             "the observation is beyond the limits:"
             f" {dict(zip(names, answer.observation.round(4).tolist(), strict=True))}"
         )
-    bounds = [
+    bounds: list[Sequence[float | None]] = [
         action.get("levels") or [action.get("least"), action.get("most")]
         for action in contract.actions
     ]
-    largest = [math.inf if None in values else max(map(abs, values)) for values in bounds]
+    largest = [
+        math.inf if None in values else max(abs(value) for value in values if value is not None)
+        for values in bounds
+    ]
     # The comparison is negated so that a NaN also ends the run.
     if not (np.abs(answer.command) <= np.array(largest) * (1.0 + 1e-6)).all():
         return f"the command is {answer.command.tolist()}, beyond the bounds of the training"

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Sequence
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from gymnasium import spaces
@@ -12,11 +12,41 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.setup import ResolvedEnv
 from codrl_mj.tasks import Task
 
-Entries = list[dict[str, Any]]
-"""Entries of an observation or action, in order: `name`, `unit` (None if unknown) and the bounds
-`least` and `most`, None if unbounded. A discrete action is one entry, with the `levels` of its
-indices, if they are known.
-"""
+
+class Entry(TypedDict, total=False):
+    """Entry of an observation or an action.
+
+    A discrete action is one entry without bounds. Only observations in a contract have `seen` and
+    the scaling by which the policy transforms the entry before its first layer: scale * entry +
+    offset.
+    """
+
+    name: str
+    """Name of the entry."""
+    unit: str | None
+    """Unit; None if it is unknown."""
+    least: float | None
+    """Smallest value; None if it is not bounded."""
+    most: float | None
+    """Largest value; None if it is not bounded."""
+    levels: list[float]
+    """Values of a discrete action's indices, if they are known."""
+    seen: list[float]
+    """Smallest and largest value in the golden episodes."""
+    scale: float
+    """Factor of the entry."""
+    offset: float
+    """Value that is added to the product."""
+    mean: float
+    """Mean of the entry in the training, if it was normalized."""
+    variance: float
+    """Variance of the entry in the training, if it was normalized."""
+    clip: float | None
+    """Largest normalized value; None if it is not limited."""
+
+
+Entries = list[Entry]
+"""Entries of an observation or an action, in order."""
 
 
 def describe_spaces(env: EnvConfig) -> tuple[Entries, Entries]:
@@ -53,8 +83,10 @@ def _describe_task(env: EnvConfig, task: Task) -> tuple[Entries, Entries]:
     commands = setup.commands
     if isinstance(commands.action_space, spaces.Box):
         return observations, describe_box(task.motors, commands.action_space, units)
-    table: Any = commands.action_forces if is_force_command else env.levels
-    names = [{"name": name, "unit": unit} for name, unit in zip(task.motors, units, strict=True)]
+    table = np.asarray(commands.action_forces if is_force_command else env.levels)
+    names: Entries = [
+        {"name": name, "unit": unit} for name, unit in zip(task.motors, units, strict=True)
+    ]
     columns = np.reshape(table, (len(table), -1)).T.tolist()
     return observations, [
         {**entry, "levels": levels} for entry, levels in zip(names, columns, strict=True)

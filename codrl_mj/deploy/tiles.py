@@ -4,11 +4,22 @@ import csv
 import dataclasses
 import io
 from collections.abc import Sequence
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
 from codrl_mj.agents.tile_coding import TileCoder, choose_actions
+from codrl_mj.deploy.spaces import Entry
+
+Float = type[np.float32] | type[np.float64]
+"""Number type of a computation."""
+
+
+class AddNode(Protocol):
+    """Function that adds nodes to an ONNX graph."""
+
+    def __call__(self, kind: str, *inputs: str | np.ndarray, **attributes: int) -> str:
+        """Add a node with inputs by name or as constants, and return the name of its output."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,13 +36,13 @@ class Tiles:
     # Discrete actions have no bounds; `Network` has these attributes.
     low = high = None
 
-    def __call__(self, observations: np.ndarray, dtype: Any = np.float32) -> np.ndarray:  # noqa: ARG002 - as a `Network`
+    def __call__(self, observations: np.ndarray, dtype: Float = np.float32) -> np.ndarray:  # noqa: ARG002 - as a `Network`
         """Return action indices (N,) for observations (N, k), always computed in double."""
         return choose_actions(
             observations, self.coder, self.table, True, 0.0, np.random.default_rng(0)
         )
 
-    def add_to_graph(self, node: Any) -> str:
+    def add_to_graph(self, node: AddNode) -> str:
         """Add the policy's nodes to an ONNX graph and return the name of the output.
 
         Args:
@@ -66,7 +77,7 @@ class Tiles:
             )
         )
 
-    def input_scaling(self, index: int) -> dict[str, float | None]:
+    def input_scaling(self, index: int) -> Entry:
         """Return the scaling of an observation entry, for the contract; see `Network`."""
         return {"scale": float(self.factors[index]), "offset": 0.0}
 
@@ -104,7 +115,7 @@ class Tiles:
     @property
     def choices(self) -> int:
         """Number of actions."""
-        return self.table.shape[1]
+        return int(self.table.shape[1])
 
     @property
     def num_working_values(self) -> int:

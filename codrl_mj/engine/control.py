@@ -9,7 +9,6 @@ import ctypes
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import mujoco
 from numba import types
@@ -28,7 +27,7 @@ from codrl_mj.engine.families import (
 )
 from codrl_mj.engine.hill import hill_callbacks
 from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.memory import callback, entry_address, f64, internal
+from codrl_mj.engine.memory import CFunction, callback, entry_address, f64, internal
 from codrl_mj.engine.model_access import command, is_disabled, output_inertia, user_address
 
 _USER_DYNAMICS, _USER_BIAS = int(mujoco.mjtDyn.mjDYN_USER), int(mujoco.mjtBias.mjBIAS_USER)
@@ -59,7 +58,7 @@ def _is_ours(model: int, actuator: int) -> bool:
 
 
 @functools.cache
-def motor_callbacks() -> dict[str, Any]:
+def motor_callbacks() -> dict[str, CFunction]:
     """Return the motors' callbacks by MuJoCo's names, in the form that its setters accept.
 
     `control` advances the actuators; `act_bias` returns the torque that they deliver. They are
@@ -116,7 +115,7 @@ def motor_callbacks() -> dict[str, Any]:
 
 # -- installation of the callbacks, which never replaces those of other libraries --
 
-_GROUPS: dict[str, tuple[tuple[str, ...], Callable[[], dict[str, Any]], str]] = {
+_GROUPS: dict[str, tuple[tuple[str, ...], Callable[[], dict[str, CFunction]], str]] = {
     "motor": (("control", "act_bias"), motor_callbacks, "actuator='ideal' or physics='analytic'"),
     "hill": (("passive",), hill_callbacks, "physics='analytic'"),
 }
@@ -129,11 +128,11 @@ class CallbackInUseError(RuntimeError):
     """Another library has set a MuJoCo callback that the package needs."""
 
 
-_INSTALLED: dict[str, Any] = {}
+_INSTALLED: dict[str, CFunction] = {}
 """The pointer that `install` last set for each of MuJoCo's callbacks, by name."""
 
 
-def _read_callback(name: str) -> tuple[bool, Any]:
+def _read_callback(name: str) -> tuple[bool, object]:
     """Return a pair: True if MuJoCo's present callback is ours; and the callback, or None."""
     # The pointers that `install` set are compared, because asking for our callbacks would compile
     # them.

@@ -11,15 +11,17 @@ import functools
 import sys
 from collections.abc import Callable, Iterator
 from types import CodeType, FunctionType, ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numba import types
+from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
+from numpy.typing import ArrayLike
 
 from codrl_mj.actuators import Family, Inputs, family_id, import_path, parameters_type
 from codrl_mj.actuators.model import advance_signature, check_family
-from codrl_mj.compile_cache import VerifiedMarker, cfunc
+from codrl_mj.compile_cache import CompiledCallback, VerifiedMarker, cfunc
 from codrl_mj.engine.memory import (
     call,
     f64,
@@ -33,7 +35,7 @@ from codrl_mj.engine.memory import (
     write,
 )
 from codrl_mj.engine.model_access import load_inertia
-from codrl_mj.user_code import Form, check_form, compile_error_message
+from codrl_mj.user_code import Form, UserFunction, check_form, compile_error_message
 
 SIGNATURE = (250700.0, 268401.0)
 """First two numbers of the `user` data of our actuators and joints: the paper's arXiv identifier.
@@ -74,12 +76,19 @@ _SIZES = np.zeros((10**6, 6), dtype=np.int32)
 """Sizes of the families, by family number."""
 _IMPORT_PATHS = np.zeros(10**6, dtype=np.uintp)
 """Addresses of the families' import paths as C strings, by family number."""
-_COMPILED: dict[int, tuple[Family, Any]] = {}
+_COMPILED: dict[int, tuple[Family, object]] = {}
 """Family number -> (family, owner of the memory that the tables point to)."""
 
 addresses_pointer = named_address("codrl_mj_families", _ADDRESSES.ctypes.data)
 sizes_pointer = named_address("codrl_mj_sizes", _SIZES.ctypes.data)
 import_paths_pointer = named_address("codrl_mj_import_paths", _IMPORT_PATHS.ctypes.data)
+
+Advance = Callable[..., tuple[tuple[float, ...], float, tuple[float, ...]]]
+"""A family's `advance`, which returns the named tuples of its state and its signals."""
+ArrayAdvance = Callable[[ArrayLike, float, ArrayLike, Inputs], tuple[np.ndarray, float, np.ndarray]]
+"""A family's `advance` (parameters, timestep, state, inputs) that returns its state and signals as
+arrays.
+"""
 
 _F64, _ADDRESS = types.float64, types.uintp
 _ADVANCE_TYPE = _F64(_ADDRESS, _F64, _ADDRESS, _ADDRESS, _ADDRESS, *(_F64,) * 6)
@@ -173,7 +182,7 @@ _REGISTERED: set[FunctionType] = set()
 """Plain functions that compiled code can call."""
 
 
-def _register_callees(function: Any) -> None:
+def _register_callees(function: FunctionType) -> None:
     """Register the Python functions that a function calls, directly or indirectly, with numba.
 
     They can still be called from Python.
@@ -202,28 +211,35 @@ def _register_callees(function: Any) -> None:
 
 @functools.cache
 def compiled_function(
-    function: Callable[..., Any], form: Form, declared: str, *argument_types: Any
-) -> Any:
+    function: UserFunction, form: Form, declared: str, *argument_types: types.Type
+) -> UserFunction:
     """Compile a user's function, and check that its result has the declared form.
 
     The check compiles it; both are skipped if the function passed in an earlier process.
     """
-    compiled, marker = internal(function), VerifiedMarker("fits", function, form, argument_types)
+    compiled = internal(function)
+    dispatcher, marker = (
+        cast(Dispatcher, compiled),
+        VerifiedMarker("fits", function, form, argument_types),
+    )
     try:
-        _register_callees(function)
+        _register_callees(cast(FunctionType, function))
         if marker.exists():
             return compiled
-        compiled.compile(argument_types)
+        dispatcher.compile(argument_types)
     except Exception as error:
         raise ValueError(compile_error_message(function, error)) from error
     check_form(
-        function, _example(compiled.overloads[argument_types].signature.return_type), form, declared
+        function,
+        _example(dispatcher.overloads[argument_types].signature.return_type),
+        form,
+        declared,
     )
     marker.write()
     return compiled
 
 
-def _example(kind: Any) -> Any:
+def _example(kind: types.Type) -> object:
     """Return 0.0 for a numeric numba type, a tuple for a tuple type, and other types unchanged."""
     if isinstance(kind, types.BaseTuple):
         return tuple(map(_example, kind))
@@ -231,7 +247,7 @@ def _example(kind: Any) -> Any:
 
 
 @functools.cache
-def _compile(family: Any) -> Any:
+def _compile(family: Family) -> CompiledCallback[..., float]:
     parameters_of, state_of = parameters_type(family), family.State
     argument_types = (
         named_tuple_type(parameters_of),
@@ -239,7 +255,9 @@ def _compile(family: Any) -> Any:
         named_tuple_type(state_of),
         named_tuple_type(Inputs),
     )
-    advance = compiled_function(family.advance, *advance_signature(family), *argument_types)
+    advance: Advance = compiled_function(
+        family.advance, *advance_signature(family), *argument_types
+    )
 
     @cfunc(_ADVANCE_TYPE, nogil=True, error_model="numpy")
     def step(
@@ -268,14 +286,14 @@ def _compile(family: Any) -> Any:
     return step
 
 
-def compiled_advance(family: Family) -> Callable[..., Any]:
+def compiled_advance(family: Family) -> ArrayAdvance:
     """Return a family's compiled `advance` for Python; its states and signals are arrays."""
     load_family(family)
     function, (states, signals, _) = _compile(family).ctypes, family_sizes(family)[:3]
 
     def advance(
-        parameters: Any, timestep: float, state: Any, inputs: Inputs
-    ) -> tuple[Any, float, Any]:
+        parameters: ArrayLike, timestep: float, state: ArrayLike, inputs: Inputs
+    ) -> tuple[np.ndarray, float, np.ndarray]:
         parameter_array, before, after, signal_array = (
             np.array(parameters),
             np.array(state),
@@ -290,7 +308,7 @@ def compiled_advance(family: Family) -> Callable[..., Any]:
 
 
 @functools.cache
-def compiled_observe(family: Family) -> Any:
+def compiled_observe(family: Family) -> Callable[[int, int, float, float, float, int], None]:
     """Return a compiled function (parameters, signals, timestep, time, key, readings) -> None.
 
     It writes the sensors' readings to `readings`. Parameters, signals and readings are passed by

@@ -21,7 +21,6 @@ joint.
 
 import functools
 import math
-from typing import Any
 
 import mujoco
 from numba import types
@@ -29,7 +28,7 @@ from numba import types
 from codrl_mj.compile_cache import cfunc
 from codrl_mj.engine.families import SIGNATURE
 from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.memory import callback, entry_address, f64, internal
+from codrl_mj.engine.memory import CFunction, callback, entry_address, f64, internal
 
 HILL_NAMES = ("signature_1", "signature_2", "gravity", "wavenumber", "height")
 """Entries of a hill joint's `user` data, in order: the signature (two numbers), the largest
@@ -76,7 +75,7 @@ def _move_geoms(model: int, data: int, body: int, height: float, slope: float) -
 
 
 @functools.cache
-def hill_callbacks() -> dict[str, Any]:
+def hill_callbacks() -> dict[str, CFunction]:
     """Return the hill's callback by MuJoCo's name, as `motor_callbacks` does for motors."""
 
     @cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")

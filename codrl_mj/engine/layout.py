@@ -15,21 +15,36 @@ constants.
 
 import ctypes
 import functools
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
+from llvmlite.ir import IRBuilder, Value
 from mujoco.introspect import ast_nodes
 from mujoco.introspect.structs import STRUCTS
 from numba import types
+from numba.core.base import BaseContext
 from numba.core.registry import cpu_target
+from numba.core.typing import Signature
 from numba.core.typing.ctypes_utils import from_ctypes
 
 from codrl_mj.compile_cache import external_function
-from codrl_mj.engine.memory import llvm_intrinsic, to_pointer
-from codrl_mj.plugin import LayoutError, library
+from codrl_mj.engine.memory import Pointer, llvm_intrinsic, to_pointer
+from codrl_mj.plugin import LayoutError as LayoutError
+from codrl_mj.plugin import library
+
+CType: TypeAlias = (
+    ast_nodes.ValueType
+    | ast_nodes.PointerType
+    | ast_nodes.ArrayType
+    | ast_nodes.AnonymousStructDecl
+)
+"""A type of C in MuJoCo's introspection."""
+# ctypes has no public name for the common base class of its types.
+CtypesType: TypeAlias = type[Any]
 
 _SCALARS = {
     "mjtNum": ctypes.c_double,
@@ -54,7 +69,7 @@ Sizes are signed, because in numba the sum of a signed and an unsigned integer i
 """
 
 
-def _ctype(node: Any) -> Any:
+def _ctype(node: CType) -> CtypesType:
     """Return the ctypes type of an introspected C type."""
     if isinstance(node, ast_nodes.PointerType):
         return ctypes.c_void_p
@@ -78,7 +93,10 @@ def _ctype(node: Any) -> Any:
     )
 
 
-def _structure(name: str, fields: Any) -> type[ctypes.Structure]:
+def _structure(
+    name: str,
+    fields: Sequence[ast_nodes.StructFieldDecl | ast_nodes.AnonymousStructDecl],
+) -> type[ctypes.Structure]:
     members = [(field.name, _ctype(field.type)) for field in fields]
     return type(name, (ctypes.Structure,), {"_fields_": members})
 
@@ -129,7 +147,7 @@ _PROBE = """
 
 
 @functools.cache
-def _live_objects() -> dict[str, Any]:
+def _live_objects() -> dict[str, mujoco.MjModel | mujoco.MjData]:
     """Return a live model and its data by the names of their structures.
 
     All counts differ, so that a wrong offset cannot read the right value by chance.
@@ -156,7 +174,7 @@ def check_field(struct_name: str, field: str) -> None:
     # MuJoCo's model compiler is not reentrant within a thread, and may be running in this one.
     with ThreadPoolExecutor(1) as thread:
         owner = thread.submit(_live_objects).result()[struct_name]
-    raw: Any = struct(struct_name).from_address(owner._address)
+    raw = struct(struct_name).from_address(owner._address)
     names = [field]
     if field.count(".") == 0 and not _is_exposed(owner, field):
         order = [member.name for member in STRUCTS[struct_name].fields]
@@ -179,7 +197,7 @@ def check_field(struct_name: str, field: str) -> None:
             )
 
 
-def _is_exposed(owner: Any, field: str) -> bool:
+def _is_exposed(owner: mujoco.MjModel | mujoco.MjData, field: str) -> bool:
     """Return True if the bindings expose a field and it is not empty."""
     live = getattr(owner, field, None)
     return isinstance(live, int | float) or getattr(live, "size", 0) > 0
@@ -197,7 +215,7 @@ class StructFields(ModuleType):
         super().__init__(f"{struct_name}.{within}".rstrip("."))
         self._owner, self._within = struct_name, within
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         """Return a field's function; create it and check the field on first access."""
         kind = STRUCTS[self._owner]
         for part in self._within.rstrip(".").split(".") if self._within else ():
@@ -207,7 +225,7 @@ class StructFields(ModuleType):
             raise AttributeError(name)
         path = f"{self._within}{name}"
         if isinstance(node, ast_nodes.ValueType) and node.name in STRUCTS:
-            attribute: Any = StructFields(self._owner, f"{path}.")
+            attribute: object = StructFields(self._owner, f"{path}.")
         else:
             check_field(self._owner, path)
             attribute = _function(self._owner, path, node)
@@ -215,23 +233,123 @@ class StructFields(ModuleType):
         return attribute
 
 
-def _function(struct_name: str, path: str, node: Any) -> Any:
+IntField = Callable[[int], int]
+FloatField = Callable[[int], float]
+"""Function of the structure's address that returns a number."""
+IntArray = Callable[[int], Pointer[int]]
+FloatArray = Callable[[int], Pointer[float]]
+"""Function of the structure's address that returns a pointer to the entries of an array."""
+
+
+class OptionFields(StructFields):
+    """Fields of `mjOption` that this package uses."""
+
+    timestep: FloatField
+    integrator: IntField
+    disableflags: IntField
+    disableactuator: IntField
+
+
+class ModelFields(StructFields):
+    """Fields of `mjModel` that this package uses."""
+
+    opt: OptionFields
+    nu: IntField
+    nv: IntField
+    njnt: IntField
+    nactuator: IntField
+    nuser_jnt: IntField
+    nuser_actuator: IntField
+    M_rownnz: IntArray
+    M_rowadr: IntArray
+    M_colind: IntArray
+    body_mass: FloatArray
+    body_geomnum: IntArray
+    body_geomadr: IntArray
+    jnt_type: IntArray
+    jnt_bodyid: IntArray
+    jnt_qposadr: IntArray
+    jnt_dofadr: IntArray
+    jnt_user: FloatArray
+    geom_pos: FloatArray
+    geom_quat: FloatArray
+    actuator_dyntype: IntArray
+    actuator_gaintype: IntArray
+    actuator_biastype: IntArray
+    actuator_dynprm: FloatArray
+    actuator_gainprm: FloatArray
+    actuator_biasprm: FloatArray
+    actuator_actearly: IntArray
+    actuator_actadr: IntArray
+    actuator_actnum: IntArray
+    actuator_ctrladr: IntArray
+    actuator_outadr: IntArray
+    actuator_group: IntArray
+    actuator_plugin: IntArray
+    actuator_ctrllimited: IntArray
+    actuator_actlimited: IntArray
+    actuator_forcelimited: IntArray
+    actuator_ctrlrange: FloatArray
+    actuator_actrange: FloatArray
+    actuator_forcerange: FloatArray
+    actuator_user: FloatArray
+    plugin_stateadr: IntArray
+    plugin_statenum: IntArray
+
+
+class DataFields(StructFields):
+    """Fields of `mjData` that this package uses."""
+
+    time: FloatField
+    pbase: IntField
+    qpos: FloatArray
+    qvel: FloatArray
+    act: FloatArray
+    act_dot: FloatArray
+    ctrl: FloatArray
+    plugin_state: FloatArray
+    qfrc_applied: FloatArray
+    qfrc_passive: FloatArray
+    xpos: FloatArray
+    xmat: FloatArray
+    geom_xpos: FloatArray
+    geom_xmat: FloatArray
+    actuator_length: FloatArray
+    actuator_velocity: FloatArray
+    actuator_force: FloatArray
+    actuator_moment: FloatArray
+    moment_rownnz: IntArray
+    moment_rowadr: IntArray
+    moment_colind: IntArray
+    qLD: FloatArray  # noqa: N815 - the engine's name
+    qLDiagInv: FloatArray  # noqa: N815 - the engine's name
+
+
+def _function(struct_name: str, path: str, node: CType) -> Callable[[int], float | Pointer[float]]:
     """Return an intrinsic that reads a field; it is inlined into its callers."""
     is_array = isinstance(node, ast_nodes.PointerType)
     element = from_ctypes(_SCALARS[node.inner_type.name if is_array else node.name])
     kind, field_offset = types.CPointer(element) if is_array else element, offset(struct_name, path)
 
-    @llvm_intrinsic(lambda address: kind(types.uintp))  # noqa: ARG005 - numba passes one
-    def field(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001 - numba fixes them
+    def generate(
+        context: BaseContext,
+        builder: IRBuilder,
+        signature: Signature,  # noqa: ARG001 - numba fixes the arguments
+        arguments: Sequence[Value],
+    ) -> Value:
         field_address = builder.add(arguments[0], context.get_constant(types.uintp, field_offset))
         return builder.load(to_pointer(builder, field_address, context.get_value_type(kind)))
+
+    @llvm_intrinsic(lambda address: kind(types.uintp), generate)  # noqa: ARG005 - numba passes one
+    def field(address: int) -> float | Pointer[float]:
+        raise NotImplementedError
 
     # Without a refresh, numba would not find the intrinsic in the function that it is compiling.
     cpu_target.typing_context.refresh()
     return field
 
 
-MODEL, DATA = StructFields("mjModel"), StructFields("mjData")
+MODEL, DATA = ModelFields("mjModel"), DataFields("mjData")
 """Fields of `mjModel` and `mjData`."""
 
 
@@ -240,21 +358,21 @@ def addresses(data: mujoco.MjData) -> tuple[int, int]:
     return data.model._address, data._address
 
 
-def field_address(owner: Any, name: str) -> int:
+def field_address(owner: mujoco.MjModel | mujoco.MjData, name: str) -> int:
     """Return the address of a field of an `MjModel` or `MjData`, or of an array's entries.
 
     The field's name may be dotted (`opt.timestep`).
     """
     live = functools.reduce(getattr, name.split("."), owner)
     if isinstance(live, np.ndarray):
-        return live.ctypes.data
+        return int(live.ctypes.data)
     return int(owner._address) + offset(
         "mjModel" if isinstance(owner, mujoco.MjModel) else "mjData", name
     )
 
 
 @functools.cache
-def engine_function(name: str) -> Any:
+def engine_function(name: str) -> Callable[[int, int], None]:
     """Return MuJoCo's function of (model, data), such as `mj_step`, for compiled code."""
     return external_function(
         f"codrl_mj_{name}", getattr(library(), name), types.void(types.uintp, types.uintp)

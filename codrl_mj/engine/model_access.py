@@ -5,15 +5,22 @@ The inertia at an actuator's shaft comes from the engine's own factorization of 
 
 import functools
 import math
-from typing import Any
 
 import mujoco
 import numpy as np
 from numba import types
 
-from codrl_mj.compile_cache import cfunc
+from codrl_mj.compile_cache import CompiledCallback, cfunc
 from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.memory import call, entry_address, internal, named_address, stack_floats, u64
+from codrl_mj.engine.memory import (
+    Pointer,
+    call,
+    entry_address,
+    internal,
+    named_address,
+    stack_floats,
+    u64,
+)
 
 _NO_CLAMP, _NUM_GROUPS, _MAX_VALUE = (
     int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL),
@@ -76,7 +83,9 @@ def output_inertia(model: int, data: int, output: int, gear: float) -> float:
 
 
 @internal(inline="always")
-def _solve_inertia(model: int, data: int, output: int, gear: float, work: Any) -> float:
+def _solve_inertia(
+    model: int, data: int, output: int, gear: float, work: np.ndarray | Pointer[float]
+) -> float:
     """Return 1/(m*M^-1*m) for the moment m of an output; `work` (nv numbers) becomes L^-T*m."""
     # M = L^T*D*L, hence m*M^-1*m is the sum of (L^-T*m)^2/D. The back substitution runs only over
     # the degrees of freedom that the moment reaches, and their ancestors in the kinematic tree,
@@ -102,7 +111,7 @@ def _solve_inertia(model: int, data: int, output: int, gear: float, work: Any) -
 
 
 @functools.cache
-def load_inertia() -> Any:
+def load_inertia() -> CompiledCallback[[int, int, int, float], float]:
     """Compile the function behind `output_inertia`, once per process, and return it.
 
     The inertia is 1/(m*M^-1*m). Here m is the gear times a row of `actuator_moment`, and M =

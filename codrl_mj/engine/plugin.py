@@ -12,13 +12,13 @@ installs these functions.
 import ctypes
 import functools
 import math
-from typing import Any
+from collections.abc import Callable
 
 import mujoco
 from numba import types
 
-from codrl_mj.actuators import BUILT_IN, Ideal, family_id, import_path
-from codrl_mj.compile_cache import cfunc, external_function, njit
+from codrl_mj.actuators import BUILT_IN, Family, Ideal, family_id, import_path
+from codrl_mj.compile_cache import CompiledCallback, cfunc, external_function, njit
 from codrl_mj.engine.families import (
     INERTIA,
     MOTION,
@@ -184,7 +184,7 @@ def _find_fault(model: int, instance: int) -> int:
 
 
 @functools.cache
-def compiled_entries() -> dict[str, Any]:
+def compiled_entries() -> dict[str, CompiledCallback[..., int | None]]:
     """Return the plugin's functions by their names in `mjpPlugin`, compiled on first use.
 
     The cache keeps them alive for as long as the process runs, because MuJoCo holds only their
@@ -258,7 +258,7 @@ def compiled_entries() -> dict[str, Any]:
         for entry in range(MODEL.plugin_statenum(model)[instance]):
             f64(state)[entry] = 0.0
 
-    init_instance = external_function(
+    init_instance: Callable[[int, int], int] = external_function(
         "codrl_mj_init_instance", _INIT_INSTANCE, types.int32(types.uintp, types.int32)
     )
 
@@ -288,7 +288,7 @@ def num_states(model: int, instance: int) -> int:
     return slot_size(_family(model, instance)) + EXTRA_STATES
 
 
-def _family(model: int, instance: int) -> Any:
+def _family(model: int, instance: int) -> Family:
     """Return the family that an instance names in its configuration.
 
     Only built-in families and those that the user has loaded are accepted, because a model file

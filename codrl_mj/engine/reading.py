@@ -2,6 +2,7 @@
 
 import numbers
 from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -26,6 +27,7 @@ from codrl_mj.engine.families import (
     slot_size,
 )
 from codrl_mj.engine.model_access import shaft_inertia
+from codrl_mj.engine.mounting import arm_outside_gear
 from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEADER_SIZE, REASONS
 from codrl_mj.plugin import FAMILY, NAME, registered_plugins
 
@@ -145,7 +147,10 @@ def _motor_at(model: mujoco.MjModel, index: int, plugin_slot: int) -> ActuatorMo
             f"user = {list(user)}: a {family.__name__} needs {header_size} numbers and"
             f" {', '.join(names)}"
         )
-    return family.from_parameter_values(user[header_size : header_size + len(names)], arm)
+    actuator: ActuatorModel = family.from_parameter_values(
+        user[header_size : header_size + len(names)], arm
+    )
+    return actuator
 
 
 def motor_slots(
@@ -243,8 +248,7 @@ def check_shafts(
     )
     names = [model.actuator(index).name or f"actuator {index}" for index in loop_actuators]
     for (index, actuator), shaft, name in zip(loop_actuators.items(), shafts, names, strict=True):
-        # In the callback backend the arm is part of the gear.
-        arm = 1.0 if model.actuator_plugin[index] < 0 else actuator.arm_radius
+        arm = arm_outside_gear(model, index, actuator)
         inertias.append(shaft_inertia(model, data, model.actuator_outadr[index], 1.0 / arm))
         try:
             # Motors on the same shaft share its inertia equally; each is checked with its share.
@@ -287,7 +291,10 @@ def _loop_radius(
     are closed; without numbers, the loops of all linear actuators are closed.
     """
     joints, motors = _joints(model, data, actuators, explicit), list(actuators.values())
-    advances = [motor.advance if held else compiled_advance(type(motor)) for motor in motors]
+    # Compiled and plain functions take the same arguments.
+    advances: list[Callable[..., Any]] = [
+        motor.advance if held else compiled_advance(type(motor)) for motor in motors
+    ]
     known_inertias = [
         inertia if motor.INERTIA and not held else np.inf
         for motor, inertia in zip(motors, inertias, strict=True)
@@ -364,10 +371,7 @@ def _joints(
         data.moment_rowadr,
         data.moment_colind,
     )
-    arms = [
-        1.0 if model.actuator_plugin[index] < 0 else actuator.arm_radius
-        for index, actuator in actuators.items()
-    ]
+    arms = [arm_outside_gear(model, index, actuator) for index, actuator in actuators.items()]
     moments = all_moments[model.actuator_outadr[list(actuators)]] / np.array(arms)[:, np.newaxis]
     engine_integrator, undamped = (
         model.opt.integrator,

@@ -5,12 +5,12 @@ import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, JointAdditions, import_path, resolve
+from codrl_mj.actuators import ActuatorModel, ActuatorSetting, JointAdditions, import_path, resolve
 from codrl_mj.engine.families import load_family, user_header
 from codrl_mj.engine.reading import check_shafts
 from codrl_mj.fields import check_joint_dynamics, check_pattern, did_you_mean
@@ -39,6 +39,9 @@ _DYNAMICS = {
 _GAINS = {mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE}
 _BIASES = {mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE}
 
+Pattern = TypeVar("Pattern", bound=str | tuple[str, ...])
+"""A regular expression for names of actuators, or several of them."""
+
 
 class MotorWarning(UserWarning):
     """Warning that a model already has a motor's dynamics, or forces that bypass a motor."""
@@ -55,7 +58,7 @@ class AddedMotor(NamedTuple):
 
 def add_motors(
     spec: mujoco.MjSpec,
-    actuators: Mapping[Any, Any],
+    actuators: Mapping[Pattern, ActuatorSetting],
     allow_unstable: bool = False,
     joint_dynamics: str | None = None,
 ) -> mujoco.MjSpec:
@@ -134,7 +137,9 @@ def _describe(target: mujoco.MjsActuator, index: int) -> str:
     return f"actuator {target.name or index}" + (f" of {target.target}" if target.target else "")
 
 
-def resolve_patterns(actuators: Mapping[str, Any], owner: str) -> dict[str, ActuatorModel]:
+def resolve_patterns(
+    actuators: Mapping[Pattern, ActuatorSetting], owner: str
+) -> dict[str, ActuatorModel]:
     """Return pattern -> actuator from a user's mapping.
 
     Args:
@@ -211,7 +216,7 @@ def match_pattern(pattern: str, names: list[list[str]], needed: bool = True) -> 
 
 
 def _motors_to_add(
-    spec: mujoco.MjSpec, model: mujoco.MjModel, actuators: Mapping[Any, Any]
+    spec: mujoco.MjSpec, model: mujoco.MjModel, actuators: Mapping[Pattern, ActuatorSetting]
 ) -> list[AddedMotor]:
     """Return the motors to add, in the order of their actuators."""
     matched: dict[int, str] = {}

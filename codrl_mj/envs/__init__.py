@@ -1,7 +1,6 @@
 """Gymnasium environments with motors; the classes are imported on first use."""
 
 import importlib
-from typing import Any
 
 from gymnasium.envs.registration import register as register_with_gymnasium
 from gymnasium.envs.registration import registry
@@ -58,7 +57,7 @@ for built_in in list(TASKS.values()):
     register(built_in)
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import a public name on first use, so that `codrl_mj.envs.config` loads nothing heavy."""
     if name in _PUBLIC:
         return getattr(importlib.import_module(_PUBLIC[name]), name)

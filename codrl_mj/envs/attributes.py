@@ -7,20 +7,27 @@ part of a `snapshot`. Values that are compiled into the task's functions are rea
 the value that an attribute already has is always allowed.
 """
 
+import abc
 import dataclasses
 import math
 import numbers
-from typing import Any
+from typing import TypeAlias
 
 import mujoco
 import numpy as np
 
+from codrl_mj.boundary import AttributeValue, PickledState
 from codrl_mj.disturbances import NO_DISTURBANCES
+from codrl_mj.envs.config import Env
 from codrl_mj.envs.setup import ResolvedEnv
 from codrl_mj.physics.analytic import AnalyticPhysics
+from codrl_mj.physics.base import Physics
 from codrl_mj.physics.variation import Variation, field_of, write_fields
 from codrl_mj.tasks import Task
 from codrl_mj.tasks.attributes import Attribute, Derived, Fixed, ModelNumber, Setting
+
+AttributeOwner: TypeAlias = mujoco.MjModel | Physics
+"""Object with the numbers of a task: the model, or the physics if it has no MuJoCo model."""
 
 
 def is_shared(attribute: Attribute) -> bool:
@@ -28,7 +35,7 @@ def is_shared(attribute: Attribute) -> bool:
     return isinstance(attribute, Fixed | Setting)
 
 
-def read(name: str, setup: ResolvedEnv, model: Any) -> Any:
+def read(name: str, setup: ResolvedEnv, model: AttributeOwner) -> AttributeValue:
     """Return an attribute's value.
 
     Args:
@@ -53,7 +60,9 @@ def read(name: str, setup: ResolvedEnv, model: Any) -> Any:
     )
 
 
-def write(name: str, value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
+def write(
+    name: str, value: AttributeValue, setup: ResolvedEnv, model: AttributeOwner
+) -> ResolvedEnv:
     """Write an attribute; the caller must call `mj_setConst` afterwards.
 
     Returns:
@@ -92,7 +101,7 @@ def write(name: str, value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
         ) from None
 
 
-def validate_states(states: Any, shape: tuple[int, ...]) -> np.ndarray:
+def validate_states(states: object, shape: tuple[int, ...]) -> np.ndarray:
     """Return mechanical states as float64; raise if their shape is wrong or one is not finite."""
     try:
         array = np.array(states, dtype=np.float64)
@@ -103,7 +112,7 @@ def validate_states(states: Any, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def _number_view(attribute: ModelNumber, model: Any) -> np.ndarray:
+def _number_view(attribute: ModelNumber, model: AttributeOwner) -> np.ndarray:
     """Return a view of the attribute's number in the model, shape (1,); writes change the model."""
     array, row = field_of(model, attribute.field), 0
     if attribute.owner:
@@ -114,31 +123,36 @@ def _number_view(attribute: ModelNumber, model: Any) -> np.ndarray:
     return rows[row, attribute.entry : attribute.entry + 1]
 
 
-def _gymnasium_env(physics: Any) -> Any:
+def _gymnasium_env(physics: AttributeOwner) -> Env:
     """Return the Gymnasium environment behind a physics without a MuJoCo model."""
     if not isinstance(physics, AnalyticPhysics) or not hasattr(physics.reference_env, "env"):
         raise AttributeError(
             f"{type(physics).__name__} has no MuJoCo model or data, and no Gymnasium environment"
             " that holds this number; use physics='mujoco'"
         )
-    return physics.reference_env.env
+    env: Env = physics.reference_env.env
+    return env
 
 
-def _finite_number(value: Any, positive: bool) -> float:
+def _finite_number(value: AttributeValue, positive: bool) -> float:
     """Return a value as float; raise if it is not finite, or not > 0 if `positive`."""
     if (
         isinstance(value, numbers.Real | np.ndarray)
         and np.size(value) == 1  # type: ignore[arg-type]
         and math.isfinite(value)
     ):
-        number = float(value)  # type: ignore[arg-type]
+        number = float(value)
         if number > 0.0 or not positive:
             return number
     raise ValueError("must be a finite number" + " > 0" * positive)
 
 
 def _write_number(
-    attribute_name: str, attribute: ModelNumber, value: Any, setup: ResolvedEnv, model: Any
+    attribute_name: str,
+    attribute: ModelNumber,
+    value: AttributeValue,
+    setup: ResolvedEnv,
+    model: AttributeOwner,
 ) -> None:
     """Write a number of the model, and the quantities that vary with it."""
     power, varies = -1 if attribute.inverse else 1, attribute.varies
@@ -161,7 +175,9 @@ def _write_number(
     _number_view(attribute, model)[0] = (number / attribute.scale) ** power
 
 
-def _write_forces(value: Any, setup: ResolvedEnv, model: Any, per_action: bool) -> ResolvedEnv:
+def _write_forces(
+    value: AttributeValue, setup: ResolvedEnv, model: AttributeOwner, per_action: bool
+) -> ResolvedEnv:
     """Write the force of each action; or the largest force, and scale the others in proportion."""
     task = setup.task
     if (
@@ -189,7 +205,7 @@ def _write_forces(value: Any, setup: ResolvedEnv, model: Any, per_action: bool) 
     )
 
 
-def _write_step(value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
+def _write_step(value: AttributeValue, setup: ResolvedEnv, model: AttributeOwner) -> ResolvedEnv:
     """Write the duration of an environment step [s]; the number of inner steps does not change."""
     duration = _finite_number(value, positive=True)
     if setup.simulation.motors_added or setup.config.disturbances != NO_DISTURBANCES:
@@ -200,6 +216,7 @@ def _write_step(value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
         model.opt.timestep = duration / setup.inner_steps
     else:
         _gymnasium_env(model)
+        assert isinstance(model, AnalyticPhysics)
         model.timestep = duration / setup.inner_steps
     return dataclasses.replace(setup, task=dataclasses.replace(setup.task, step_duration=duration))
 
@@ -213,7 +230,9 @@ class _AttributeDescriptor:
     def __init__(self, name: str) -> None:
         self._name = name
 
-    def __get__(self, env: Any, owner: Any = None) -> Any:
+    def __get__(
+        self, env: "GymnasiumAttributes | None", owner: type | None = None
+    ) -> AttributeValue:
         if env is None:
             return self
         attribute = env.task.attributes.get(self._name)
@@ -225,7 +244,7 @@ class _AttributeDescriptor:
             f"{type(env).__name__} of {env.task.name!r} has no attribute {self._name!r}"
         )
 
-    def __set__(self, env: Any, value: Any) -> None:
+    def __set__(self, env: "GymnasiumAttributes", value: AttributeValue) -> None:
         attribute = env.task.attributes.get(self._name)
         # All environments share the class, so the descriptor may be of another task's attribute.
         if attribute is None:
@@ -237,10 +256,23 @@ class _AttributeDescriptor:
 class GymnasiumAttributes:
     """Mixin that gives an environment the attributes of its task."""
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    @property
+    @abc.abstractmethod
+    def task(self) -> Task:
+        """The task."""
+
+    @abc.abstractmethod
+    def _read_attribute(self, name: str) -> AttributeValue:
+        """Return an attribute's value."""
+
+    @abc.abstractmethod
+    def _write_attribute(self, name: str, value: AttributeValue) -> None:
+        """Write an attribute's value."""
+
+    def __setstate__(self, state: PickledState) -> None:
         """Restore the environment, in this or another process."""
         self.__dict__.update(state)
-        self._offer_attributes(self.task)  # type: ignore[attr-defined]
+        self._offer_attributes(self.task)
 
     def _offer_attributes(self, task: Task) -> None:
         """Add descriptors of a task's attributes to the class; call it at the end of `__init__`."""

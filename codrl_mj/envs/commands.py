@@ -2,18 +2,19 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Drive, Ideal, Servo
+from codrl_mj.boundary import Action
 from codrl_mj.disturbances import NO_DISTURBANCES, Disturbances, check_delay
 from codrl_mj.engine.reading import actuators_sharing_motor
 from codrl_mj.engine.reading import motors as motors_of
 from codrl_mj.engine.specs import ON_JOINT
-from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.config import EnvConfig, Space
+from codrl_mj.physics.base import Force
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
 
@@ -130,7 +131,7 @@ class TaskCommands:
             else (max_commands, scales, len(max_commands))
         )
         """Largest command of a box action, force [N or N*m] per unit command, number of motors."""
-        self.action_space: spaces.Space[Any] = task.action_space
+        self.action_space: Space = task.action_space
         """Action space of the agent: the task's, indices of a table, or a box of commands."""
         self.action_forces = (
             None if task.forces is None else np.array(task.forces, dtype=np.float64)
@@ -148,7 +149,7 @@ class TaskCommands:
             table = _discrete_levels(task, name, levels, commands)
             self.action_space, self.action_forces = spaces.Discrete(len(table)), table * scales[0]
 
-    def force(self, action: Any) -> Any:
+    def force(self, action: Action) -> Force:
         """Return the force [N] or torque [N*m] of an action; an array (n,) for several motors.
 
         Box actions beyond their bounds saturate.
@@ -177,7 +178,7 @@ class TaskCommands:
         forces = np.clip(array.astype(np.float64), -max_command, max_command) * scale
         return float(forces[0]) if count == 1 else forces
 
-    def forces(self, actions: Any) -> np.ndarray:
+    def forces(self, actions: Action) -> np.ndarray:
         """Return the forces of a batch of actions (N, ...), shape (N,), or (N, n) for n motors."""
         space, array = self.action_space, np.asarray(actions)
         discrete = isinstance(space, spaces.Discrete)
@@ -200,7 +201,8 @@ class TaskCommands:
             row = int(np.argmax(wrong.reshape(len(array), -1).any(axis=1)))
             raise ValueError(f"actions[{row}] = {array[row]}: not in {space} (environment {row})")
         if self.action_forces is not None:
-            return self.action_forces[array]
+            chosen: np.ndarray = self.action_forces[array]
+            return chosen
         limit, scale, count = self._box
         commands = array[:, 0] if count == 1 else array
         return np.clip(commands.astype(np.float64), -limit, limit) * scale
@@ -242,7 +244,7 @@ class ControlCommands:
     def __init__(
         self,
         data: mujoco.MjData,
-        actions: spaces.Space,
+        actions: Space,
         motors: Mapping[int, Command | None],
         disturbances: Disturbances,
         step_duration: float | None,
@@ -315,7 +317,8 @@ class ControlCommands:
 
     def _command(self, model: mujoco.MjModel, commands_by_index: Mapping[int, Command]) -> None:
         """Apply the units and limits of commands to the action space and to the model."""
-        space: Any = self.action_space
+        space = self.action_space
+        assert isinstance(space, spaces.Box)
         self._scales = np.ones(model.nu)
         low, high = space.low.astype(np.float64), space.high.astype(np.float64)
         for index, command in commands_by_index.items():
@@ -358,9 +361,9 @@ class ControlCommands:
         )
 
     @property
-    def memory(self) -> dict[str, np.ndarray]:
-        """Live array of delayed commands and scheduled pulses; no entry without disturbances."""
-        return {"disturbances": self._disturber.memory} if self._disturber.enabled else {}
+    def memory(self) -> np.ndarray:
+        """Live array of delayed commands and scheduled pulses; empty without disturbances."""
+        return self._disturber.memory
 
     def begin(self, key: float) -> None:
         """Reset the disturbances at the start of an episode, with its random key."""
@@ -368,7 +371,7 @@ class ControlCommands:
             self._disturber.reset(np.zeros(1, dtype=int), key, self._holding_commands())
             self._data.qfrc_applied[self._dofs] = 0.0
 
-    def _holding_commands(self) -> Any:
+    def _holding_commands(self) -> np.ndarray | float:
         """Return the commands that hold the motors in place: 0 unless commands are positions."""
         slopes, offsets = self._holding_controls * self._gains
         if not slopes.any():
@@ -377,9 +380,10 @@ class ControlCommands:
         # environment's own data as it is.
         data = copy.copy(self._data)
         mujoco.mj_fwdPosition(data.model, data)
-        return slopes * data.actuator_length[self._outputs] + offsets
+        commands: np.ndarray = slopes * data.actuator_length[self._outputs] + offsets
+        return commands
 
-    def controls(self, action: Any) -> Any:
+    def controls(self, action: Action) -> Action:
         """Return the environment's action after scaling and disturbances; apply loads to joints."""
         if (self._scales is not None or self._disturber.enabled) and np.shape(
             action

@@ -25,7 +25,7 @@ The environment must not be deleted during the calls.
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numba
 import numpy as np
@@ -36,10 +36,12 @@ from codrl_mj.compile_cache import njit
 from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import f32, f64, i64, internal, stack_floats, to_floats
 from codrl_mj.envs.setup import FIRST_OPTION, NEEDS_KEY, ResolvedEnv
-from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
+from codrl_mj.physics.base import Compiled, Force, NumbaTuple, Physics, Stepping
+from codrl_mj.physics.compiled_task import Outcomes, compiled_outcomes
+from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.physics.rows import BatchRows, Lane, load, store
 from codrl_mj.physics.sharing import make_shared_kernel
-from codrl_mj.physics.stepping import OBSERVATION, OPTIONS, Stepping, simulation_at
+from codrl_mj.physics.stepping import OBSERVATION, OPTIONS, simulation_at
 
 
 class VectorStep(NamedTuple):
@@ -67,17 +69,21 @@ class VectorStep(NamedTuple):
     """Last row of the trace without force and speed, shape (columns, N, motors)."""
 
 
-class Kernels(NamedTuple):
-    """Compiled functions; `pointers` is explained in `codrl_mj.physics.stepping`."""
+CompiledStep = Callable[[Force, int], tuple[float, bool, bool]]
+CompiledReset = Callable[[np.random.Generator, np.ndarray, np.ndarray, int], None]
 
-    step: Compiled
+
+class Kernels(NamedTuple):
+    """Compiled functions, from `_kernels`; `codrl_mj.physics.stepping` explains `pointers`."""
+
+    step: CompiledStep
     """(force, pointers) -> (reward, terminated, is_finite): one environment step.
 
     The force [N or N*m] is the desired one; an array (n,) for several motors. The observation is
     filled. If `is_finite` is False, the simulation diverged and the environment must be reset. The
     actuators' signals are in the trace.
     """
-    reset: Compiled
+    reset: CompiledReset
     """(generator, low, high, pointers) -> None: start an episode.
 
     The initial state is drawn by the numpy `Generator` between `low` and `high` (see
@@ -92,9 +98,9 @@ class Kernels(NamedTuple):
 class CompiledEnv(NamedTuple):
     """An environment for compiled loops; see the docstring of the module."""
 
-    step: Compiled
+    step: CompiledStep
     """See `Kernels.step`."""
-    reset: Compiled
+    reset: CompiledReset
     """See `Kernels.reset`."""
     pointers: int
     """Address of the simulation's table of pointers: the last argument of both functions."""
@@ -110,7 +116,14 @@ class CompiledEnv(NamedTuple):
     """Upper bounds of the initial draws, without reset options, shape (n,)."""
 
 
-def compiled_env(env: Any) -> CompiledEnv | None:
+class HasSetup(Protocol):
+    """Environment of a task, such as `ActuatedEnv`."""
+
+    setup: ResolvedEnv
+    physics: Physics
+
+
+def compiled_env(env: HasSetup) -> CompiledEnv | None:
     """Return an environment's compiled parts.
 
     Returns:
@@ -128,7 +141,7 @@ def compiled_env(env: Any) -> CompiledEnv | None:
     return CompiledEnv(*parts, setup.commands.action_forces, low, high)
 
 
-def bind_observation(setup: ResolvedEnv, physics: Any) -> tuple[int, np.ndarray]:
+def bind_observation(setup: ResolvedEnv, physics: Physics) -> tuple[int, np.ndarray]:
     """Connect a simulation to its observation array; return the table's address and the array."""
     _, observation = physics.bound_arrays or (
         None,
@@ -144,9 +157,10 @@ def bind_observation(setup: ResolvedEnv, physics: Any) -> tuple[int, np.ndarray]
     return physics.pointers, observation
 
 
-def compiled_kernels(setup: ResolvedEnv, physics: Any) -> Kernels:
+def compiled_kernels(setup: ResolvedEnv, physics: Physics | MujocoBatchPhysics) -> Kernels:
     """Return the functions for environments of one kind; they are compiled once per process."""
     task = setup.task
+    assert physics.stepping is not None
     sensors = len(setup.simulation.family.OBSERVED) if setup.sensors else 0
     has_single_motor, size = len(task.motors) == 1, len(task.state_names)
     sizes = size, len(setup.observation_names), len(setup.config.options)
@@ -164,14 +178,14 @@ def compiled_kernels(setup: ResolvedEnv, physics: Any) -> Kernels:
 def _kernels(
     stepping: Stepping,
     outcomes: Outcomes,
-    initial_state: Callable[..., Any],
+    initial_state: Compiled,
     has_single_motor: bool,
     sensors: int,
     size: int,
     observation_size: int,
     options_size: int,
 ) -> Kernels:
-    advance, start, read, read_sensors = stepping
+    simulate, start, read, read_sensors = stepping
     observe, reward_of, is_terminated = outcomes.observe, outcomes.reward, outcomes.terminated
     jit = njit(nogil=True, error_model="numpy")
     initial_entries = internal(initial_state)
@@ -190,13 +204,13 @@ def _kernels(
                     observation[first + motor * sensors + entry] = sensor_values[motor, entry]
 
     @jit
-    def step(force: Any, pointers: int) -> tuple[float, bool, bool]:
+    def step(force: Force, pointers: int) -> tuple[float, bool, bool]:
         before, after = (
             numba.carray(stack_floats(size), size),
             numba.carray(stack_floats(size), size),
         )
         read(before, pointers)
-        is_finite = advance(force, pointers)
+        is_finite = simulate(force, pointers)
         trace = simulation_at(pointers)[4]
         last = trace[len(trace) - 1]
         observe_row(last, after, pointers)
@@ -224,7 +238,9 @@ def _kernels(
         observe_row(np.zeros(simulation_at(pointers)[4].shape[1:]), state, pointers)
 
     @internal
-    def step_range(first: int, end: int, lane: Any, rows: Any, steps: Any) -> int:
+    def step_range(
+        first: int, end: int, lane: NumbaTuple, rows: NumbaTuple, steps: NumbaTuple
+    ) -> int:
         # The batch passes plain tuples; they become named tuples again to be readable.
         steps, lane, rows, num_diverged = VectorStep(*steps), Lane(*lane), BatchRows(*rows), 0
         stepping, observations, signals, elapsed = (
@@ -251,7 +267,9 @@ def _kernels(
         return num_diverged
 
     @jit
-    def observe_rows(indices: np.ndarray, lane: Any, rows: Any, observations: np.ndarray) -> None:
+    def observe_rows(
+        indices: np.ndarray, lane: NumbaTuple, rows: NumbaTuple, observations: np.ndarray
+    ) -> None:
         lane, rows = Lane(*lane), BatchRows(*rows)
         no_signals, state = np.zeros(lane.trace.shape[1:]), np.empty(size)
         for row in indices:

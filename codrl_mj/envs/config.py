@@ -20,6 +20,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from codrl_mj.actuators import ActuatorModel, DCMotorActuator, combined_name, mapping_of
+from codrl_mj.boundary import Argument, Info, Options
 from codrl_mj.disturbances import NO_DISTURBANCES, UNMODIFIED_JOINT, Disturbances, Joint, resolve
 from codrl_mj.envs.distributions import Distribution, parse_randomize
 from codrl_mj.fields import check_joint_dynamics, check_names
@@ -28,8 +29,14 @@ from codrl_mj.user_code import load_object
 
 Env = gymnasium.Env[Any, Any]
 """Environment; observations and actions may be of any type."""
+Space = gymnasium.spaces.Space[Any]
+"""Space of actions or observations; its elements may be of any type."""
 VecEnv = VectorEnv[Any, Any, Any]
 """Vector environment; observations, actions and their arrays may be of any type."""
+StoredActuators = ActuatorModel | tuple[ActuatorModel, ...] | Mapping[str, ActuatorModel]
+"""Value of `EnvConfig.actuator` after validation: one actuator, one for each motor of a task, or
+patterns of motors' names with their actuators.
+"""
 COMMON_FIELDS = (
     *("task", "actuator", "action", "observe_actuator", "max_episode_steps", "allow_unstable"),
     *("disturbances", "randomize", "options"),
@@ -64,7 +71,7 @@ class EnvSource(abc.ABC):
         return reference_of(self, type(self).__module__)
 
     @abc.abstractmethod
-    def make(self, config: "EnvConfig", **arguments: Any) -> Env:
+    def make(self, config: "EnvConfig", **arguments: Argument) -> Env:
         """Make an environment whose motors the package can record.
 
         Args:
@@ -77,7 +84,7 @@ class EnvSource(abc.ABC):
         """
 
     @abc.abstractmethod
-    def make_vec(self, config: "EnvConfig", num_envs: int, **arguments: Any) -> VecEnv:
+    def make_vec(self, config: "EnvConfig", num_envs: int, **arguments: Argument) -> VecEnv:
         """Make a vector environment, by default in autoreset mode `SameStep`.
 
         Args:
@@ -90,11 +97,11 @@ class EnvSource(abc.ABC):
         """
 
     @abc.abstractmethod
-    def action_space(self, config: "EnvConfig") -> "gymnasium.spaces.Space[Any]":
+    def action_space(self, config: "EnvConfig") -> Space:
         """Return the action space without motors; other commands change its bounds or size."""
 
     @abc.abstractmethod
-    def actuators(self, actuator: Any) -> Any:
+    def actuators(self, actuator: object) -> "StoredActuators":
         """Return the user's `actuator` as the configuration stores it.
 
         Raises:
@@ -102,13 +109,11 @@ class EnvSource(abc.ABC):
         """
 
     @abc.abstractmethod
-    def actuators_by_name(self, actuators: Any) -> dict[str, ActuatorModel]:
+    def actuators_by_name(self, actuators: "StoredActuators") -> dict[str, ActuatorModel]:
         """Return motor, or pattern of motors, -> actuator from the result of `actuators`."""
 
     @abc.abstractmethod
-    def override_actuators(
-        self, config: "EnvConfig", patterns: Mapping[str, Any]
-    ) -> dict[str, Any]:
+    def override_actuators(self, config: "EnvConfig", patterns: Mapping[str, object]) -> Info:
         """Return motor, or pattern, -> actuator: `patterns`, and the configuration's for the rest.
 
         Args:
@@ -116,7 +121,7 @@ class EnvSource(abc.ABC):
             patterns: pattern of motors' names -> actuator that replaces the configuration's.
         """
 
-    def options(self, options: Any) -> Any:
+    def options(self, options: Options) -> Options:
         """Return options as the configuration stores them: as a mapping that JSON can hold.
 
         Raises:
@@ -133,11 +138,11 @@ class EnvSource(abc.ABC):
             ) from None
         return json_options
 
-    def non_default_options(self, options: Any) -> dict[str, Any]:
+    def non_default_options(self, options: Options) -> Info:
         """Return the options that differ from their defaults, by name."""
         return dict(options)
 
-    def code(self, options: Any) -> set[str | Path]:
+    def code(self, options: Options) -> set[str | Path]:
         """Return names of modules and paths of files with its code; options may name files."""
         option_values = [
             value for value in self.non_default_options(options).values() if isinstance(value, str)
@@ -154,7 +159,7 @@ class SourceKind(NamedTuple):
     """Function that returns True if a name is of this kind, such as a Gymnasium id."""
     find: Callable[[str], EnvSource]
     """Function that returns the source of a name that the kind claims."""
-    wrap: Callable[[Any, str | None], EnvSource | None]
+    wrap: Callable[[object, str | None], EnvSource | None]
     """Function that returns the source of an object, such as a task; None if it is of another kind.
     Its second argument is the object's `module:NAME`, if it was loaded by it.
     """
@@ -166,7 +171,7 @@ import this one.
 """
 
 
-def find_source(env: Any) -> EnvSource:
+def find_source(env: object) -> EnvSource:
     """Return the source of an environment.
 
     Args:
@@ -214,7 +219,7 @@ def is_source_name(name: str) -> bool:
     return not Path(name).is_dir() and any(kind.claims(name) for kind in SOURCE_KINDS)
 
 
-def options_mapping(options: Any) -> dict[str, Any]:
+def options_mapping(options: Options) -> Info:
     """Return options as keyword arguments, from a mapping, a task's `NamedTuple` or None."""
     try:
         return options._asdict() if hasattr(options, "_asdict") else dict(options or {})
@@ -239,6 +244,7 @@ class EnvConfig:
     `HalfCheetah-v5` (`package:ID` imports the package first); or `module:NAME` of a custom task, of
     a function that makes environments, or of an env source. In Python also such an object itself.
     """
+    # A user's value of any documented form; after validation it is a `StoredActuators`.
     actuator: Any = "default"
     """Actuator that delivers the force. A name (`default`: the task's default, which is the paper's
     actuator if there is one; `ideal`, `paper`, `weak`, `weaker`, `open_loop`; or the name of a
@@ -293,7 +299,7 @@ class EnvConfig:
     files, a mapping of fields to distributions is also accepted. The drawn values are in the
     reset's info, `randomization`.
     """
-    options: Any = None
+    options: Options = None
     """Options of the task, a mapping (CartPole: `center_radius`, `sutton_barto_reward`), stored as
     the task's `NamedTuple`; for a third-party environment the keyword arguments of its constructor,
     such as frame_skip.
@@ -338,8 +344,8 @@ class EnvConfig:
 
     @classmethod
     def of(
-        cls, env: Any, actuator: Any = None, arguments: Mapping[str, Any] | None = None
-    ) -> tuple["EnvConfig", dict[str, Any]]:
+        cls, env: object, actuator: object = None, arguments: Mapping[str, Argument] | None = None
+    ) -> tuple["EnvConfig", Info]:
         """Return an environment's configuration, and the arguments that are not part of it.
 
         Args:
@@ -355,7 +361,9 @@ class EnvConfig:
         fields = {} if actuator is None else {"actuator": actuator}
         return config.override({**fields, **(arguments or {})})
 
-    def override(self, arguments: Mapping[str, Any]) -> tuple["EnvConfig", dict[str, Any]]:
+    def override(
+        self, arguments: Mapping[str, Argument]
+    ) -> tuple["EnvConfig", dict[str, Argument]]:
         """Return a copy with fields and options replaced, and the arguments that are neither."""
         source, remaining = self.source, dict(arguments)
         fields = {name: remaining.pop(name) for name in source.fields if name in remaining}
@@ -401,7 +409,7 @@ class EnvConfig:
         return self.max_episode_steps or self.source.time_limit
 
     @property
-    def action_space(self) -> "gymnasium.spaces.Space[Any]":
+    def action_space(self) -> Space:
         """Action space without motors; other commands change its bounds or size, not its type."""
         return self.source.action_space(self)
 
@@ -413,11 +421,11 @@ class EnvConfig:
         )
 
     @property
-    def policy_fields(self) -> dict[str, Any]:
+    def policy_fields(self) -> Info:
         """Fields that define a policy's actions and observations; they cannot change later."""
         return {name: getattr(self, name) for name in ("action", "levels", "observe_actuator")}
 
-    def build(self, **arguments: Any) -> Env:
+    def build(self, **arguments: Argument) -> Env:
         """Build the environment.
 
         Args:
@@ -437,7 +445,7 @@ class EnvConfig:
             )
         return env
 
-    def build_vec(self, num_envs: int = 1, **arguments: Any) -> VecEnv:
+    def build_vec(self, num_envs: int = 1, **arguments: Argument) -> VecEnv:
         """Build N environments as a Gymnasium vector environment; see `codrl_mj.make_vec`."""
         # A list holds one actuator per environment, so it is not a value of the field `actuator`
         # and bypasses `override`.
@@ -449,7 +457,7 @@ class EnvConfig:
         config, remaining = self.override(arguments)
         return config.source.make_vec(config, num_envs, **actuators_per_env, **remaining)
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> Info:
         """Return the configuration as JSON-serializable values; `from_mapping` reads it."""
         # Names of runs are hashes of this mapping. A field that was added later is left out at its
         # default, so that the names of existing runs stay valid.
@@ -472,7 +480,7 @@ class EnvConfig:
         }
 
     @classmethod
-    def from_mapping(cls, mapping: Any, base: "EnvConfig | None" = None) -> "EnvConfig":
+    def from_mapping(cls, mapping: object, base: "EnvConfig | None" = None) -> "EnvConfig":
         """Create a configuration from a mapping of all fields or some of them.
 
         Args:
@@ -503,7 +511,7 @@ class EnvConfig:
         if base is None:
             return cls(**fields)
         if source.reference != base.task:
-            defaults: dict[str, Any] = {
+            defaults: Info = {
                 field.name: None for field in dataclasses.fields(cls) if field.default is None
             }
             defaults |= {"task": fields["task"], "actuator": source.default_actuator}
@@ -515,7 +523,7 @@ class EnvConfig:
         return dataclasses.replace(base, **fields)
 
 
-def _to_json_values(actuator: Any) -> Any:
+def _to_json_values(actuator: "StoredActuators") -> object:
     """Convert the field `actuator` to values that JSON can hold."""
     if isinstance(actuator, Mapping):
         return {pattern: mapping_of(each_actuator) for pattern, each_actuator in actuator.items()}
@@ -526,7 +534,7 @@ def _to_json_values(actuator: Any) -> Any:
     )
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     """Return numpy's numbers and arrays as Python's numbers and lists."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 

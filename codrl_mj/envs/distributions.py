@@ -12,7 +12,7 @@ import math
 import numbers
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -210,7 +210,7 @@ def split_pattern(path: str) -> tuple[str, str]:
     return pattern, field
 
 
-def parse_randomize(randomize: Any) -> dict[str, Distribution]:
+def parse_randomize(randomize: object) -> dict[str, Distribution]:
     """Return path -> distribution, in the order of drawing.
 
     Args:
@@ -240,13 +240,13 @@ def parse_randomize(randomize: Any) -> dict[str, Distribution]:
             if pattern and field.startswith(MODEL):
                 raise ValueError(f"{field} is the model's, not a motor's: leave {pattern!r} out")
             check_pattern(pattern)
-            distributions[path] = value if isinstance(value, Distribution) else parse(value)
+            distributions[path] = value if isinstance(value, Distribution) else parse(value)  # type: ignore[arg-type]
         except ValueError as error:
             raise ValueError(f"randomize: {path}: {error}") from None
     return distributions
 
 
-def _flatten(randomize: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def _flatten(randomize: Mapping[str, object]) -> Iterator[tuple[str, object]]:
     """Yield path and distribution, with the pattern in front of the field in nested mappings."""
     for name, value in randomize.items():
         if (
@@ -259,7 +259,7 @@ def _flatten(randomize: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield str(name), value
 
 
-def _split_item(item: Any) -> tuple[str, str]:
+def _split_item(item: object) -> tuple[str, str]:
     """Split 'PATH=DISTRIBUTION' into its two parts; a pattern may itself contain '='."""
     match = re.fullmatch(r"\s*((?:.*:)?[^:=]+?)\s*=(.*)", item) if isinstance(item, str) else None
     if match is None:

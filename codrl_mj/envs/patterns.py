@@ -5,13 +5,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.actuators import ActuatorModel, is_family
+from codrl_mj.actuators import ActuatorModel, ActuatorSetting, is_family
 
 ALL_MOTORS = ".*"
 """Pattern that matches all motors."""
 
 
-def actuators_by_pattern(actuator: Any, default: str = "ideal") -> Mapping[str, Any]:
+def actuators_by_pattern(actuator: Any, default: str = "ideal") -> Mapping[str, ActuatorSetting]:
     """Return pattern -> actuator, from a user's value of `actuator`."""
     if actuator in ({}, []) or isinstance(actuator, list | tuple):
         raise ValueError(
@@ -21,7 +21,7 @@ def actuators_by_pattern(actuator: Any, default: str = "ideal") -> Mapping[str, 
     return pattern_mapping(actuator) or {ALL_MOTORS: default if actuator == "default" else actuator}
 
 
-def pattern_mapping(actuator: Any) -> Mapping[str, Any] | None:
+def pattern_mapping(actuator: object) -> Mapping[str, ActuatorSetting] | None:
     """Return a user's `actuator` if it is a mapping of patterns to actuators; otherwise None."""
     if not isinstance(actuator, Mapping) or {"family", "name"} & actuator.keys():
         return None

@@ -4,7 +4,7 @@ import copy
 import random
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -22,14 +22,16 @@ from codrl_mj.actuators import (
     from_array,
     parameter_paths,
 )
+from codrl_mj.boundary import Info
+from codrl_mj.engine.mounting import joint_addresses, set_arm_in_gear
 from codrl_mj.engine.reading import actuators_sharing_motor, check_shafts
 from codrl_mj.engine.specs import match_pattern, matchable_names
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_pattern
 from codrl_mj.fields import did_you_mean
+from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.physics.variation import (
     Variation,
     arms_and_additions,
-    joint_addresses,
     variable_names,
     write_fields,
 )
@@ -40,6 +42,16 @@ MAX_REDRAWS = 1000
 """Number of consecutive draws with an unstable current loop after which a reset fails."""
 Uniforms = Callable[[np.ndarray, int], np.ndarray]
 """(simulations (m,), count) -> the next `count` draws in [0, 1) of each, shape (m, count)."""
+
+
+class VariableSimulation(Protocol):
+    """Simulation whose motors and model can be replaced before a reset."""
+
+    def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
+        """Replace the motors by others of their families."""
+
+    def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
+        """Write fields of the model, as `Variation.fields` returns them."""
 
 
 class Randomization:
@@ -276,9 +288,9 @@ class RandomizationState:
         columns = np.array([names.index(name) for name in variation.names], dtype=int)
         return variation.fields(self._values[np.ix_(rows, columns)], additions, shown)
 
-    def report(self, row: int = 0) -> dict[str, Any]:
+    def report(self, row: int = 0) -> Info:
         """Return a simulation's drawn values for `info`, grouped by pattern; NaN before a reset."""
-        report: dict[str, Any] = {}
+        report: Info = {}
         for (path, field_type), value in zip(
             self.randomization.types.items(), self._values[row], strict=True
         ):
@@ -288,13 +300,13 @@ class RandomizationState:
             )
         return report | {"rejected": int(self._rejected[row])} if report else {}
 
-    def infos(self, rows: np.ndarray) -> dict[str, Any]:
+    def infos(self, rows: np.ndarray) -> Info:
         """Return the drawn values as Gymnasium's vector infos: nested, with masks."""
         if not self.randomization.distributions:
             return {}
         mask = np.zeros(len(self._values), dtype=bool)
         mask[rows] = True
-        report: dict[str, Any] = {}
+        report: Info = {}
         for name, column in self.drawn_values().items():
             value_type = self.randomization.types.get(name, int)
             report[name] = np.zeros(len(mask), dtype=value_type)
@@ -361,9 +373,7 @@ def check_extremes(
             actuators = dict(zip(motors, state.motors(), strict=True))
             for index, actuator in actuators.items():
                 actuator.check(randomization.timestep)
-                # In a model with the control callback, the gear contains the arm.
-                if model.actuator_plugin[index] < 0:
-                    model.actuator_gear[model.actuator_outadr[index], 0] = 1.0 / actuator.arm_radius
+                set_arm_in_gear(model, index, actuator)
         except ValueError:
             # A reset rejects such values and draws again, so they are no error.
             continue
@@ -381,7 +391,9 @@ def check_extremes(
             raise ValueError(f"randomize: {drawn_values}: {error}; or narrow the bounds") from None
 
 
-def apply_to_simulation(simulation: Any, state: RandomizationState, rows: np.ndarray) -> None:
+def apply_to_simulation(
+    simulation: VariableSimulation, state: RandomizationState, rows: np.ndarray
+) -> None:
     """Write the drawn values into the only simulation of a `Physics` or an `ActuatorBank`."""
     if state.randomization.draws_actuator:
         simulation.set_actuators(state.motors())
@@ -389,7 +401,9 @@ def apply_to_simulation(simulation: Any, state: RandomizationState, rows: np.nda
         simulation.set_model(state.model_fields(rows, shown=True))
 
 
-def apply_to_batch(physics: Any, state: RandomizationState, rows: np.ndarray) -> None:
+def apply_to_batch(
+    physics: MujocoBatchPhysics, state: RandomizationState, rows: np.ndarray
+) -> None:
     """Write the drawn values into a `MujocoBatchPhysics`, whose motors are of one family."""
     parameters, arms, additions = state.parameters(rows)
     if state.randomization.draws_actuator:
@@ -533,13 +547,15 @@ def _check_motor_field(
 
 def _type_of_field(family: Family, path: str) -> type:
     """Return the type of a family's field: float, int or bool."""
-    value: Any = family()
+    value: object = family()
     for part in split_pattern(path)[1].split("."):
         value = getattr(value, part, None)
     return type(value) if isinstance(value, int) else float
 
 
-def _depends_on(quantity: Callable[[ActuatorModel], Any], motor: ActuatorModel, path: str) -> bool:
+def _depends_on(
+    quantity: Callable[[ActuatorModel], object], motor: ActuatorModel, path: str
+) -> bool:
     """Return True if a quantity of a motor depends on a field.
 
     A factor of 0 would hide the dependence, so the test is repeated with all fields at 2.

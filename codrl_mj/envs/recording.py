@@ -1,11 +1,14 @@
 """Recorder of every integration step of a third-party environment."""
 
-from typing import Any
+from typing import SupportsFloat
 
 import mujoco
 import numpy as np
 
-from codrl_mj.envs.motors import ActuatorBank
+from codrl_mj.actuators import ActuatorModel
+from codrl_mj.boundary import Action, Info, Observation
+from codrl_mj.envs.config import Env
+from codrl_mj.envs.model_bank import ModelBank
 from codrl_mj.envs.setup import unwrap_single
 
 
@@ -16,9 +19,7 @@ class SubstepRecorder:
     in `ActuatedEnv`; states and speeds are those of the model.
     """
 
-    def __init__(
-        self, motors: ActuatorBank, command: str, step_duration: float | None = None
-    ) -> None:
+    def __init__(self, motors: ModelBank, command: str, step_duration: float | None = None) -> None:
         """Attach to the simulation of the motors.
 
         Args:
@@ -33,13 +34,13 @@ class SubstepRecorder:
         self.step_duration = float(step_duration or model.opt.timestep)
         """Duration of the last environment step [s]; initially `dt`, or the model's time step."""
         self.signal_names, self.trace_names = (
-            tuple(motors.signals()),
+            motors.signal_names,
             (*motors.readout.names, "speed"),
         )
         self.command, self.motor_names = command, motors.names
 
     @property
-    def actuator(self) -> Any:
+    def actuator(self) -> ActuatorModel | tuple[ActuatorModel, ...]:
         """Actuator of the present episode; for several motors a tuple."""
         return unwrap_single(tuple(self._motors.motors.values()))
 
@@ -65,9 +66,10 @@ class SubstepRecorder:
             data.moment_rowadr,
             data.moment_colind,
         )
-        return self._moments[self._outputs] @ data.qvel
+        speeds: np.ndarray = self._moments[self._outputs] @ data.qvel
+        return speeds
 
-    def step(self, env: Any, action: Any) -> Any:
+    def step(self, env: Env, action: Action) -> tuple[Observation, SupportsFloat, bool, bool, Info]:
         """Take an environment step and record its integration steps; not thread-safe."""
         self._rows, original_step, original_step2, start_time = (
             [],
@@ -89,9 +91,12 @@ class SubstepRecorder:
             if data is self._data:
                 self._append_row()
 
+        # Environments call `mujoco.mj_step` in their own code, often several times in a step, and
+        # MuJoCo has no callback after an integration step. So the function itself is replaced, for
+        # as long as this step takes.
         # dm_control's physics takes the first integration step of each environment step as mj_step2
         # and mj_step1, so recording mj_step alone would miss it.
-        mujoco.mj_step, mujoco.mj_step2 = recording_step, recording_step2  # type: ignore[assignment]
+        mujoco.mj_step, mujoco.mj_step2 = recording_step, recording_step2
         try:
             outcome = env.step(action)
         finally:

@@ -1,15 +1,17 @@
 """Vector environments with the interface of Stable-Baselines3."""
 
 import time
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from codrl_mj.envs.config import EnvConfig
+from codrl_mj.boundary import Argument, AttributeValue, Info
+from codrl_mj.envs.config import Env, EnvConfig
+from codrl_mj.envs.config import VecEnv as GymnasiumVecEnv
 from codrl_mj.envs.serial import SerialVectorEnv
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.envs.vector import ActuatedVectorEnv
@@ -24,7 +26,7 @@ class ActuatedVecEnv(VecEnv):
     records them). The actuators' signals of the last step are in `signals`, as arrays.
     """
 
-    def __init__(self, env: "VectorEnv[Any, Any, Any]") -> None:
+    def __init__(self, env: GymnasiumVecEnv) -> None:
         """Wrap a vector environment in `SAME_STEP` mode.
 
         Raises:
@@ -76,7 +78,7 @@ class ActuatedVecEnv(VecEnv):
             )
         observations, _ = self.env.reset(seed=self._seeds, options=options or None)
         drawn_values = self.env.randomization
-        self.reset_infos: list[dict[str, Any]] = [
+        self.reset_infos: list[Info] = [
             (
                 {"randomization": {name: values[row] for name, values in drawn_values.items()}}
                 if drawn_values
@@ -103,14 +105,14 @@ class ActuatedVecEnv(VecEnv):
         """Store the actions of the next step."""
         self._actions = actions
 
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:  # type: ignore[override]
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Info]]:
         """Step every environment; an environment whose episode ends is reset at once."""
         assert self._actions is not None, "step_async comes first"
         observations, rewards, terminated, truncated, infos = self.env.step(self._actions)
         self._returns += rewards
         self._lengths += 1
         ended = terminated | truncated
-        outcomes: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        outcomes: list[Info] = [{} for _ in range(self.num_envs)]
         for row in np.flatnonzero(ended).tolist():
             outcomes[row] = self._outcome(
                 row, infos["final_obs"][row], bool(truncated[row] and not terminated[row])
@@ -118,7 +120,7 @@ class ActuatedVecEnv(VecEnv):
         self._returns[ended], self._lengths[ended] = 0.0, 0
         return observations, rewards.astype(np.float32), ended, outcomes
 
-    def _outcome(self, row: int, observation: np.ndarray, truncated: bool) -> dict[str, Any]:
+    def _outcome(self, row: int, observation: np.ndarray, truncated: bool) -> Info:
         """Return the info of an environment whose episode ended."""
         return {
             "terminal_observation": observation,
@@ -132,7 +134,7 @@ class ActuatedVecEnv(VecEnv):
 
     def finish_episode(
         self, observation: np.ndarray, total: float, length: int, truncated: bool, signals: Signals
-    ) -> tuple[np.ndarray, list[dict[str, Any]]]:
+    ) -> tuple[np.ndarray, list[Info]]:
         """Record an episode that compiled code ran in a single environment, and reset it.
 
         Args:
@@ -201,7 +203,7 @@ class ActuatedVecEnv(VecEnv):
         del mode
         return self.env.image()
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[AttributeValue]:
         """Return an attribute for each environment; all share an attribute of the vector."""
         shared = isinstance(self.env, SerialVectorEnv) and hasattr(self.env, attr_name)
         values = (
@@ -211,27 +213,33 @@ class ActuatedVecEnv(VecEnv):
         )
         return [values[index] for index in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(
+        self, attr_name: str, value: AttributeValue, indices: VecEnvIndices = None
+    ) -> None:
         """Set an attribute of the vector environment, or of each single environment."""
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError(
                 f"set_attr({attr_name!r}): the environments share it; it can only be set for all of"
                 " them"
             )
-        owners: list[Any] = [self.env]
+        owners: list[object] = [self.env]
         if isinstance(self.env, SerialVectorEnv) and not hasattr(self.env, attr_name):
             owners = [env.unwrapped for env in self.env.envs]
         for owner in owners:
             setattr(owner, attr_name, value)
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
-    ) -> list[Any]:
+        self,
+        method_name: str,
+        *method_args: Argument,
+        indices: VecEnvIndices = None,
+        **method_kwargs: Argument,
+    ) -> list[AttributeValue]:
         """Call a method of the vector environment once; repeat its result for each environment."""
         result = getattr(self.env, method_name)(*method_args, **method_kwargs)
         return [result for _ in self._get_indices(indices)]
 
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
         """Return True for `Monitor`, which this class replaces; there are no other wrappers."""
         from stable_baselines3.common.monitor import Monitor
 
@@ -239,7 +247,10 @@ class ActuatedVecEnv(VecEnv):
 
 
 def make_sb3_vec_env(
-    env_id: Any, num_envs: int = 64, actuator: Any = None, **arguments: Any
+    env_id: str | EnvConfig | Callable[..., Env],
+    num_envs: int = 64,
+    actuator: object = None,
+    **arguments: Argument,
 ) -> ActuatedVecEnv:
     """Create a Stable-Baselines3 `VecEnv` of many environments.
 

@@ -2,16 +2,18 @@
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import cast
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 
+from codrl_mj.boundary import Argument, Info
 from codrl_mj.envs.config import Env
 from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
 from codrl_mj.envs.vector import check_counts
 from codrl_mj.physics import Signals
+from codrl_mj.tasks import Task
 
 Array = np.ndarray
 VECTOR_ARGUMENTS = ("num_threads", "autoreset_mode")
@@ -38,7 +40,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
         num_threads: int = 0,
         bytes_per_env: int = BYTES_PER_ENV,
-        **arguments: Any,
+        **arguments: Argument,
     ) -> None:
         """Build the environments.
 
@@ -76,9 +78,10 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         )
 
     @property
-    def task(self) -> Any:
+    def task(self) -> Task:
         """The task of the first environment."""
-        return self.get_attr("task")[0]
+        task: Task = self.get_attr("task")[0]
+        return task
 
     @property
     def randomization(self) -> dict[str, Array]:
@@ -107,7 +110,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
             for name, dtype in dtypes.items()
         }
 
-    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Info]:
         """Advance every environment by one step, or reset it, as `autoreset_mode` says."""
         observations, rewards, terminated, truncated, infos = super().step(actions)
         ended = terminated | truncated
@@ -128,8 +131,8 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
 
     def image(self, row: int = 0) -> Array | None:
         """Return an image of one environment, (height, width, 3), uint8; None if not rendered."""
-        image: Any = self.envs[row].render()
-        return image
+        # A single environment renders one image.
+        return cast(Array | None, self.envs[row].render())
 
     def snapshot(self) -> dict[str, Array]:
         """Return the complete state as arrays: of the environments, and of the vector itself."""
@@ -187,8 +190,8 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
 
 
 def _make_env(
-    max_episode_steps: int | None, make: Callable[..., Any], arguments: Mapping[str, Any]
-) -> Any:
+    max_episode_steps: int | None, make: Callable[..., Env], arguments: Mapping[str, Argument]
+) -> Env:
     """Make one environment, with a time limit [steps] if there is one."""
     env = make(**arguments)
     return env if max_episode_steps is None else TimeLimit(env, int(max_episode_steps))

@@ -2,22 +2,22 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
-from codrl_mj.actuators.noise import MAX_KEY
+from codrl_mj.boundary import Argument
 from codrl_mj.disturbances import check_delay
 from codrl_mj.engine.reading import check_shafts
+from codrl_mj.envs.bank import extend_space, needs_key, sensor_names
 from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.motors import extend_space, sensor_names
 from codrl_mj.envs.randomization import Randomization, check_extremes
-from codrl_mj.physics import PHYSICS, Physics, Signals, SimulationConfig, trace_names
-from codrl_mj.physics.base import make_info_reader
+from codrl_mj.physics import PHYSICS, Physics, SimulationConfig
+from codrl_mj.physics.base import Force
 from codrl_mj.physics.compiled_task import Outcomes, compiled_outcomes
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.variation import bare_model
@@ -104,6 +104,7 @@ class ResolvedEnv:
     def randomization(self) -> Randomization:
         """Distributions of the fields that are drawn at every reset."""
         simulation, config = self.simulation, self.config
+        # The task's model with ideal actuators; `simulate` compiles the one with the motors.
         model = bare_model(self.task.name, config.joint)
         motors = {
             model.actuator(name).id: actuator
@@ -150,19 +151,7 @@ class ResolvedEnv:
     @functools.cached_property
     def needs_key(self) -> bool:
         """True if an episode's disturbances or sensors need a random key."""
-        draws_numbers = self.config.disturbances.random or self.randomization.may_need_key
-        return draws_numbers or any(actuator.random for actuator in self.simulation.actuators)
-
-    def keys(self, random: Callable[[int], np.ndarray]) -> np.ndarray:
-        """Return the random keys of m episodes, shape (m,); a single 0 if none is needed.
-
-        A key selects the counter-based random numbers of disturbances and sensors. `random` is a
-        function (count) -> draws in [0, 1), shape (m, count).
-        """
-        if not self.needs_key:
-            return np.zeros(1)
-        # The product is exactly an integer: draws are multiples of 2**-53, the factor is 2**53.
-        return random(1)[:, 0] * MAX_KEY
+        return needs_key(self.simulation.actuators, self.config.disturbances, self.randomization)
 
     # -- observations and rewards of the agent --------------------------------------------
 
@@ -192,17 +181,13 @@ class ResolvedEnv:
         """The task's compiled functions, and its options as a vector."""
         return compiled_outcomes(self.task), np.array(self.config.options, dtype=np.float64)
 
-    def observation(self, physics: Physics, row: np.ndarray | None = None) -> np.ndarray:
-        """Return a simulation's observation (k,), float32; `row` is the last row of its trace."""
-        size = len(self.task.observation_names)
-        observation = np.empty(size + len(self.sensors), np.float32)
-        self._outcomes[0].observe(np.ascontiguousarray(physics.state), observation)
-        if self.sensors:
-            row = np.zeros_like(physics.trace[-1]) if row is None else row
-            observation[size:] = physics.read_sensors(row).reshape(-1)
+    def observation(self, state: np.ndarray) -> np.ndarray:
+        """Return the task's observation of a mechanical state, (k,), float32, without sensors."""
+        observation = np.empty(len(self.task.observation_names), np.float32)
+        self._outcomes[0].observe(np.ascontiguousarray(state), observation)
         return observation
 
-    def outcome(self, before: np.ndarray, force: Any, after: np.ndarray) -> tuple[float, bool]:
+    def outcome(self, before: np.ndarray, force: Force, after: np.ndarray) -> tuple[float, bool]:
         """Return reward and termination of a step between two states under forces [N or N*m]."""
         outcomes, options = self._outcomes
         before, after = np.ascontiguousarray(before), np.ascontiguousarray(after)
@@ -210,33 +195,18 @@ class ResolvedEnv:
         reward = outcomes.reward(before, forces if len(forces) > 1 else forces[0], after, options)
         return float(reward), bool(outcomes.terminated(after))
 
-    @functools.cached_property
-    def _read_info(self) -> Callable[[Any], Signals]:
-        """Function that turns columns of the trace into a mapping of names to columns."""
-        return make_info_reader(trace_names(self.simulation.family)[:-1])
 
-    def __getstate__(self) -> dict[str, Any]:
-        # The reader is a local closure and cannot be pickled; it is rebuilt on demand.
-        return {name: value for name, value in self.__dict__.items() if name != "_read_info"}
-
-    def signals(self, columns: Sequence[Any] | np.ndarray, desired: Any) -> Signals:
-        """Return a trace's columns by name, with the `desired` force [N or N*m].
-
-        If the actuator does not follow a force command, `desired_force` is the delivered force.
-        """
-        signals = self._read_info(columns)
-        signals["desired_force"] = (
-            desired if self.commands.is_torque_controlled else signals["actual_force"]
-        )
-        return signals
+_Item = TypeVar("_Item")
 
 
-def unwrap_single(values: Sequence[Any]) -> Any:
+def unwrap_single(values: Sequence[_Item]) -> _Item | tuple[_Item, ...]:
     """Return the only element of a sequence, or the whole sequence as a tuple."""
     return values[0] if len(values) == 1 else tuple(values)
 
 
-def task_config(task: str | EnvConfig, actuator: Any, arguments: Mapping[str, Any]) -> EnvConfig:
+def task_config(
+    task: str | EnvConfig, actuator: object, arguments: Mapping[str, Argument]
+) -> EnvConfig:
     """Return the configuration that keyword arguments of a task's environment describe.
 
     Raises:
@@ -257,7 +227,7 @@ def task_config(task: str | EnvConfig, actuator: Any, arguments: Mapping[str, An
     return config
 
 
-def is_per_environment(actuator: Any, task: Task) -> bool:
+def is_per_environment(actuator: Argument, task: Task) -> bool:
     """Return True if `actuator` is a list with one actuator per environment, not per motor."""
     is_listed = isinstance(actuator, Sequence) and not isinstance(actuator, str)
     return is_listed and (
@@ -266,7 +236,9 @@ def is_per_environment(actuator: Any, task: Task) -> bool:
     )
 
 
-def configs_per_environment(config: EnvConfig, num_envs: int, actuator: Any) -> list[EnvConfig]:
+def configs_per_environment(
+    config: EnvConfig, num_envs: int, actuator: Argument
+) -> list[EnvConfig]:
     """Return the configuration of each of many environments.
 
     Args:
@@ -298,7 +270,7 @@ def configs_per_environment(config: EnvConfig, num_envs: int, actuator: Any) -> 
 
 
 def set_up_many(
-    config: EnvConfig, num_envs: int, actuator: Any
+    config: EnvConfig, num_envs: int, actuator: Argument
 ) -> tuple[ResolvedEnv, list[tuple[ActuatorModel, ...]]]:
     """Return the setup that many environments share, and the actuators of each of them.
 

@@ -1,26 +1,53 @@
 """A single task environment with the interface of Gymnasium."""
 
-import functools
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import gymnasium
+import mujoco
 import numpy as np
 
-from codrl_mj.actuators import IDEAL
-from codrl_mj.envs.attributes import GymnasiumAttributes, read, validate_states, write
-from codrl_mj.envs.compiled import bind_observation, compiled_kernels
+from codrl_mj.actuators import IDEAL, ActuatorModel
+from codrl_mj.boundary import Action, Argument, AttributeValue, Info, PickledState
+from codrl_mj.envs.attributes import (
+    AttributeOwner,
+    GymnasiumAttributes,
+    read,
+    validate_states,
+    write,
+)
+from codrl_mj.envs.compiled import CompiledStep, bind_observation, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.randomization import RandomizationState, apply_to_simulation
 from codrl_mj.envs.setup import ResolvedEnv, task_config, unwrap_single
 from codrl_mj.envs.snapshots import check_snapshot, encode_name, generator_from_words
-from codrl_mj.physics import MujocoPhysics, SimulationConfig, signal_names, trace_names
+from codrl_mj.envs.task_bank import TaskBank
+from codrl_mj.physics import MujocoPhysics, SimulationConfig
+from codrl_mj.physics.base import Force, Physics, Scene, Signals
 from codrl_mj.physics.offscreen import DisplayWindow, OffscreenRenderer, check_view
 from codrl_mj.physics.streams import generator_words
 from codrl_mj.tasks import Task
 
 
-class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
+class BoundStep(NamedTuple):
+    """A task's compiled step, bound to one simulation."""
+
+    force_of: Callable[[Action], Force]
+    """(action) -> desired force [N or N*m]."""
+    step: CompiledStep
+    """`Kernels.step`: (force, pointers) -> (reward, terminated, is_finite). It fills `observation`
+    and the trace.
+    """
+    pointers: int
+    """Address of the simulation's table of pointers."""
+    observation: np.ndarray
+    """Observation, shape (k,), float32; the next step overwrites it."""
+    read_columns: Callable[[], Sequence[object] | np.ndarray]
+    """Return a copy of the last row of the trace: a number or array for each column."""
+    name_signals: Callable[[Sequence[object] | np.ndarray, Force], Signals]
+    """(columns, force) -> `info` of the step."""
+
+
+class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Action]):
     """A classic-control task whose actions go through an actuator.
 
     Observation, action, reward, initial states and termination are those of Gymnasium's task. The
@@ -37,7 +64,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     """
 
     # Class attribute, as in Gymnasium; an instance replaces it and never changes it.
-    metadata: dict[str, Any] = {  # noqa: RUF012
+    metadata: Info = {  # noqa: RUF012
         "render_modes": ["human", "rgb_array"],
         "render_fps": 50,
     }
@@ -45,13 +72,13 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     def __init__(
         self,
         task: str | EnvConfig,
-        actuator: Any = None,
+        actuator: object = None,
         render_mode: str | None = None,
         width: int = 480,
         height: int = 480,
         camera: str = "fixed",
         pretty: bool = False,
-        **arguments: Any,
+        **arguments: Argument,
     ) -> None:
         """Build the environment.
 
@@ -77,29 +104,24 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         config = task_config(task, actuator, arguments)
         self.setup = ResolvedEnv.build(config)
         self.physics = self.setup.simulate()
-        apply_values = functools.partial(apply_to_simulation, self.physics)
-        self._randomization_state = RandomizationState(
-            self.setup.randomization, [self.setup.simulation.actuators], apply_values
-        )
+        self.bank = TaskBank(self.setup, self.physics, [self.setup.simulation.actuators])
+        """The actuators: their commands, draws, sensors and signals."""
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         self._renderer: OffscreenRenderer | None = None
         self._window: DisplayWindow | None = None
-        self._fallback_scene: Any = None
+        self._fallback_scene: MujocoPhysics | None = None
         if render_mode is not None:
-            check_view(self._scene().scene[0], width, height, camera)
-        self.action_space = self.setup.commands.action_space
+            check_view(self._scene()[1][0], width, height, camera)
+        self.action_space = self.bank.action_space
         self.observation_space = self.setup.observation_space
         self.observation_names, self.motor_names = self.setup.observation_names, self.task.motors
         self.command = config.action
         """Name of the agent's command."""
-        self.signal_names, self.trace_names = (
-            signal_names(family := self.setup.simulation.family),
-            trace_names(family),
-        )
+        self.signal_names, self.trace_names = self.bank.signal_names, self.bank.trace_names
         """Names of the actuators' signals in `info`, and of the columns of `trace`."""
-        self._compiled: tuple[Any, ...] | None = None
+        self._bound_step: BoundStep | None = None
         self._offer_attributes(self.task)
 
     @property
@@ -108,22 +130,22 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         return self.setup.task
 
     @property
-    def actuator(self) -> Any:
+    def actuator(self) -> ActuatorModel | tuple[ActuatorModel, ...]:
         """Actuator of the present episode; for several motors a tuple."""
-        return unwrap_single(self._randomization_state.motors(0, self.setup.config.actuators))
+        return unwrap_single(tuple(self.bank.motors.values()))
 
     @property
-    def motors(self) -> dict[int, Any]:
+    def motors(self) -> dict[int, ActuatorModel]:
         """Motor index of the task -> actuator of the present episode."""
-        return dict(enumerate(self._randomization_state.motors(0, self.setup.config.actuators)))
+        return self.bank.motors
 
     @property
-    def model(self) -> Any:
+    def model(self) -> mujoco.MjModel:
         """The `mujoco.MjModel` (MuJoCo physics only); one `mj_step` is one integration step."""
         return self._engine()[0]
 
     @property
-    def data(self) -> Any:
+    def data(self) -> mujoco.MjData:
         """The `mujoco.MjData` (MuJoCo physics only)."""
         return self._engine()[1]
 
@@ -133,7 +155,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         return self.physics.state.copy()
 
     @state.setter
-    def state(self, state: Any) -> None:
+    def state(self, state: object) -> None:
         self.physics.state = validate_states(state, self.physics.state.shape)
 
     @property
@@ -160,30 +182,31 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         """Update the bodies' poses in `data`, which lag one integration step behind."""
         self.physics.show(self.physics.state)
 
-    def _engine(self) -> tuple[Any, Any]:
+    def _engine(self) -> Scene:
         if self.physics.scene is None:
             raise AttributeError(
                 f"{type(self.physics).__name__} has no MuJoCo model or data; use physics='mujoco'"
             )
         return self.physics.scene
 
-    def _attribute_target(self) -> Any:
+    def _attribute_target(self) -> AttributeOwner:
         """Return the object that `read` and `write` of attributes take as the model."""
         return self.physics if self.physics.scene is None else self.physics.scene[0]
 
-    def _read_attribute(self, name: str) -> Any:
+    def _read_attribute(self, name: str) -> AttributeValue:
         return read(name, self.setup, self._attribute_target())
 
-    def _write_attribute(self, name: str, value: Any) -> None:
+    def _write_attribute(self, name: str, value: AttributeValue) -> None:
         physics = self.physics
         snapshot = physics.snapshot()
-        self.setup, self._compiled = write(name, value, self.setup, self._attribute_target()), None
+        self.setup = self.bank.setup = write(name, value, self.setup, self._attribute_target())
+        self._bound_step = None
         physics.set_model({})
         physics.restore(snapshot)
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[np.ndarray, Info]:
         """Start an episode, with the motor at rest.
 
         Args:
@@ -193,19 +216,17 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         super().reset(seed=seed)
         generator, setup = self.np_random, self.setup
         initial = setup.task.draw_initial_state(generator, options)
-        self._randomization_state.draw_single(generator)
-        self.physics.reset(
-            initial, float(setup.keys(lambda count: generator.random((1, count)))[0])
-        )
+        self.bank.randomization.draw_single(generator)
+        self.physics.reset(initial, self.bank.key(generator))
         if self.render_mode == "human":
             self.render()
         drawn_values = self.randomization
         return (
-            self.setup.observation(self.physics),
+            self._observation(None),
             {"randomization": drawn_values} if drawn_values else {},
         )
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Advance by one environment step.
 
         Args:
@@ -216,11 +237,12 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             ValueError: the action is not in the action space, or NaN.
             SimulationDivergedError: a value of the simulation is not finite.
         """
-        if self._compiled is None:
+        if self._bound_step is None:
             if self.physics.stepping is None:
-                return self._step_in_python(self.setup.commands.force(action))
-            self._compiled = self._bind_step()
-        force_of, step, pointers, observation, read_columns, name_signals = self._compiled
+                return self._step_in_python(self.bank.force(action))
+            self._bound_step = self._bind_step()
+        # A named tuple is unpacked faster than its fields are read one by one.
+        force_of, step, pointers, observation, read_columns, name_signals = self._bound_step
         force = force_of(action)
         reward, terminated, is_finite = step(force, pointers)
         if not is_finite:
@@ -229,47 +251,52 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             self.render()
         return observation.copy(), reward, terminated, False, name_signals(read_columns(), force)
 
-    def _bind_step(self) -> tuple[Any, ...]:
-        """Return the compiled step, its arguments, and the functions that `step` calls."""
-        setup, row = self.setup, self.physics.trace[-1]
-        columns = row[0].tolist if len(row) == 1 else row.T.copy
-        compiled = (
-            compiled_kernels(setup, self.physics).step,
-            *bind_observation(setup, self.physics),
+    def _bind_step(self) -> "BoundStep":
+        """Connect the compiled step to the arrays that it reads and fills."""
+        row = self.physics.trace[-1]
+        return BoundStep(
+            self.bank.force,
+            compiled_kernels(self.setup, self.physics).step,
+            *bind_observation(self.setup, self.physics),
+            row[0].tolist if len(row) == 1 else row.T.copy,
+            self.bank.signals,
         )
-        return setup.commands.force, *compiled, columns, setup.signals
 
-    def _step_in_python(self, force: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def _observation(self, row: np.ndarray | None) -> np.ndarray:
+        """Return the observation (k,), float32; `row` is the last row of the trace, or None."""
+        observation = self.setup.observation(self.physics.state)
+        if not self.bank.sensors:
+            return observation
+        return np.append(observation, self.bank.sensor_values(row)).astype(np.float32)
+
+    def _step_in_python(self, force: Force) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Take a step without the compiled function, for a physics in Python."""
         physics, setup = self.physics, self.setup
         before = physics.state
         physics.step(force)
         row, after = physics.trace[-1], physics.state
-        info = setup.signals(row.T.copy() if len(row) > 1 else row[0].tolist(), force)
+        info = self.bank.signals(row.T.copy() if len(row) > 1 else row[0].tolist(), force)
         if self.render_mode == "human":
             self.render()
         reward, terminated = setup.outcome(before, info["actual_force"], after)
-        return setup.observation(physics, physics.trace[-1]), reward, terminated, False, info
+        return self._observation(row), reward, terminated, False, info
 
     @property
-    def randomization(self) -> dict[str, Any]:
+    def randomization(self) -> Info:
         """Drawn values of the present episode, as in the reset's info; NaN before a reset."""
-        return self._randomization_state.report()
+        return self.bank.randomization.report()
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays: simulation, motor, generator, drawn values.
 
         Generators of the spaces and counts of wrappers are not included.
         """
-        state = {
+        return {
             "task": encode_name(self.task.name),
             "physics": self.physics.snapshot(),
             "generator": generator_words(self.np_random),
-        }
-        if self.physics.memory.size:
-            state["disturbances"] = self.physics.memory.copy()
-        return state | {
-            name: np.array(rows[0]) for name, rows in self._randomization_state.snapshot().items()
+            # The bank has a row for each simulation.
+            **{name: np.array(rows[0]) for name, rows in self.bank.snapshot().items()},
         }
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
@@ -280,12 +307,11 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
                 shapes; nothing was changed.
         """
         check_snapshot(snapshot, self.snapshot(), "task")
-        self._randomization_state.restore(snapshot)
+        self.bank.restore(snapshot)
         self.physics.restore(snapshot["physics"])
-        self.physics.memory[:] = snapshot.get("disturbances", 0.0)
         self.np_random = generator_from_words(snapshot["generator"])
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """Render the state as an image (height, width, 3), uint8; None unless mode is `rgb_array`.
 
         Raises:
@@ -302,11 +328,10 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             raise ValueError(
                 f"render_mode = {self.render_mode!r}: must be None, 'human' or 'rgb_array'"
             )
-        scene = self._scene()
-        model, data = scene.scene
+        physics, (model, data) = self._scene()
         if self._renderer is None:
             self._renderer = OffscreenRenderer(model, **self._view)  # type: ignore[arg-type]
-        scene.show(self.physics.state)
+        physics.show(self.physics.state)
         image = self._renderer.render(data)
         if self.render_mode == "rgb_array":
             return image
@@ -315,15 +340,15 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self._window.show(image, self.metadata["render_fps"])
         return None
 
-    def _scene(self) -> Any:
+    def _scene(self) -> tuple[Physics, Scene]:
         """Return the physics to render; if it has no scene, a simulation with ideal actuators."""
         if self.physics.scene is not None:
-            return self.physics
+            return self.physics, self.physics.scene
         if self._fallback_scene is None:
             self._fallback_scene = MujocoPhysics(
                 SimulationConfig(self.task, [IDEAL] * len(self.task.motors))
             )
-        return self._fallback_scene
+        return self._fallback_scene, self._fallback_scene.scene
 
     def close(self) -> None:
         """Free the OpenGL context, and close the window."""
@@ -332,11 +357,11 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
                 resource.close()
         self._renderer = self._window = self._fallback_scene = None
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> PickledState:
         """Return all but the renderer, the window and the compiled step; a copy makes new ones."""
         return self.__dict__ | {
             "_renderer": None,
             "_window": None,
             "_fallback_scene": None,
-            "_compiled": None,
+            "_bound_step": None,
         }

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Mapping
-from typing import Any
+from typing import Protocol, cast
 
 import gymnasium
 import mujoco
@@ -10,29 +10,36 @@ import numpy as np
 from gymnasium.utils import seeding
 from mujoco.introspect.structs import STRUCTS
 
+from codrl_mj.envs.config import Env
 from codrl_mj.physics.streams import set_generator_words
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
-def time_limits(env: "gymnasium.Env[Any, Any]") -> list[Any]:
+class TimeLimitWrapper(Protocol):
+    """Gymnasium's `TimeLimit`, or the class that rl-zoo3 replaces it by."""
+
+    _elapsed_steps: int | None
+
+
+def time_limits(env: Env) -> list[TimeLimitWrapper]:
     """Return the time-limit wrappers, outermost first, up to a wrapper with its own snapshots."""
-    limits = []
+    limits: list[TimeLimitWrapper] = []
     while isinstance(env, gymnasium.Wrapper) and not hasattr(type(env), "snapshot"):
         # The attribute identifies Gymnasium's TimeLimit and the class that rl-zoo3 replaces it by.
         if "_elapsed_steps" in vars(env):
-            limits.append(env)
+            limits.append(cast(TimeLimitWrapper, env))
         env = env.env
     return limits
 
 
-def elapsed_steps(env: "gymnasium.Env[Any, Any]") -> np.ndarray:
+def elapsed_steps(env: Env) -> np.ndarray:
     """Return the steps that the `time_limits` have counted, int64; -1 before the first reset."""
     counted = [limit._elapsed_steps for limit in time_limits(env)]
     return np.array([-1 if steps is None else steps for steps in counted], dtype=np.int64)
 
 
-def set_elapsed_steps(env: "gymnasium.Env[Any, Any]", elapsed: np.ndarray) -> None:
+def set_elapsed_steps(env: Env, elapsed: np.ndarray) -> None:
     """Write the steps that `elapsed_steps` returned into the `time_limits`."""
     for limit, steps in zip(time_limits(env), elapsed.tolist(), strict=True):
         limit._elapsed_steps = None if steps < 0 else steps

@@ -4,13 +4,13 @@ import functools
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from codrl_mj.actuators import ActuatorModel
+from codrl_mj.boundary import Argument, Info, Options
 from codrl_mj.envs import register
 from codrl_mj.envs.config import (
     COMMON_FIELDS,
@@ -19,6 +19,8 @@ from codrl_mj.envs.config import (
     EnvConfig,
     EnvSource,
     SourceKind,
+    Space,
+    StoredActuators,
     VecEnv,
     options_mapping,
 )
@@ -52,7 +54,7 @@ class TaskEnvSource(EnvSource):
         """Name of a built-in task, `module:NAME` of a custom one."""
         return reference_of(self.task)
 
-    def make(self, config: EnvConfig, **arguments: Any) -> Env:
+    def make(self, config: EnvConfig, **arguments: Argument) -> Env:
         """Make an environment with `gymnasium.make`.
 
         The arguments are those of `gymnasium.make` and of `codrl_mj.envs.ActuatedEnv`.
@@ -60,11 +62,14 @@ class TaskEnvSource(EnvSource):
         if unknown := {name: arguments[name] for name in arguments if name not in _NOT_OPTIONS}:
             # Gymnasium would append all arguments to the error of the class.
             self.options(unknown)
-        limit = {"max_episode_steps": config.time_limit, "disable_env_checker": True}
+        limit: dict[str, Argument] = {
+            "max_episode_steps": config.time_limit,
+            "disable_env_checker": True,
+        }
         env: Env = gymnasium.make(self.task.env_id, task=config, **(limit | arguments))
         return env
 
-    def make_vec(self, config: EnvConfig, num_envs: int, **arguments: Any) -> VecEnv:
+    def make_vec(self, config: EnvConfig, num_envs: int, **arguments: Argument) -> VecEnv:
         """Make a vector environment: a batch on MuJoCo, otherwise stepped one by one."""
         from codrl_mj.envs.serial import SerialVectorEnv
         from codrl_mj.envs.setup import configs_per_environment
@@ -73,7 +78,10 @@ class TaskEnvSource(EnvSource):
 
         limit, is_human = config.time_limit, arguments.get("render_mode") == "human"
         if config.physics == "mujoco" and not is_human:
-            settings = {"autoreset_mode": AutoresetMode.SAME_STEP, "max_episode_steps": limit}
+            settings: dict[str, Argument] = {
+                "autoreset_mode": AutoresetMode.SAME_STEP,
+                "max_episode_steps": limit,
+            }
             return ActuatedVectorEnv(num_envs, config, **(settings | arguments))
         if config.physics == "mujoco":
             gymnasium.logger.warn(
@@ -85,15 +93,15 @@ class TaskEnvSource(EnvSource):
         env_functions = [functools.partial(ActuatedEnv, config) for config in configs]
         return SerialVectorEnv(num_envs, env_functions, limit, **arguments)
 
-    def action_space(self, config: EnvConfig) -> "gymnasium.spaces.Space[Any]":  # noqa: ARG002
+    def action_space(self, config: EnvConfig) -> Space:  # noqa: ARG002
         """Return the task's action space, which is the same with any actuator."""
         return self.task.action_space
 
-    def code(self, options: Any) -> set[str | Path]:  # noqa: ARG002 - options contain no files
+    def code(self, options: Options) -> set[str | Path]:  # noqa: ARG002 - options contain no files
         """Return the task's module and MJCF file."""
         return {self.task.reward.__module__, asset_path(self.task.asset).resolve()}
 
-    def options(self, values: Any) -> Any:
+    def options(self, values: Options) -> Options:
         """Return the task's options as its `NamedTuple`."""
         option_type = self.task.options
         options = (
@@ -131,7 +139,7 @@ class TaskEnvSource(EnvSource):
             }
         )
 
-    def non_default_options(self, options: Any) -> dict[str, Any]:
+    def non_default_options(self, options: Options) -> Info:
         """Return the options that differ from their defaults."""
         return {
             name: value
@@ -139,7 +147,7 @@ class TaskEnvSource(EnvSource):
             if value != options._field_defaults[name]
         }
 
-    def actuators(self, actuator: Any) -> Any:
+    def actuators(self, actuator: Argument) -> ActuatorModel | tuple[ActuatorModel, ...]:
         """Return the actuator of a single motor, or a tuple with those of several, in order."""
         patterns = pattern_mapping(actuator)
         if patterns is not None:
@@ -148,7 +156,7 @@ class TaskEnvSource(EnvSource):
         actuators = resolve_actuators(actuator, self.task)
         return actuators[0] if len(actuators) == 1 else actuators
 
-    def _by_pattern(self, patterns: Mapping[str, Any]) -> dict[str, Any]:
+    def _by_pattern(self, patterns: Mapping[str, object]) -> Info:
         """Return motor -> actuator, from a mapping of patterns of motor names to actuators."""
         # A local import, because the module imports numba, which takes long.
         from codrl_mj.engine.specs import match_pattern, split_pattern
@@ -168,22 +176,18 @@ class TaskEnvSource(EnvSource):
                 actuators_by_motor[motor] = actuator
         return actuators_by_motor
 
-    def override_actuators(self, config: EnvConfig, patterns: Mapping[str, Any]) -> dict[str, Any]:
+    def override_actuators(self, config: EnvConfig, patterns: Mapping[str, object]) -> Info:
         """Return motor -> actuator: those of `patterns`, and the configuration's for the rest."""
         return {**config.actuators_by_name, **self._by_pattern(patterns)}
 
-    def actuators_by_name(self, actuators: Any) -> dict[str, ActuatorModel]:
+    def actuators_by_name(self, actuators: StoredActuators) -> dict[str, ActuatorModel]:
         """Return motor -> actuator."""
-        return dict(
-            zip(
-                self.task.motors,
-                actuators if isinstance(actuators, tuple) else (actuators,),
-                strict=True,
-            )
-        )
+        assert not isinstance(actuators, Mapping)
+        motors = actuators if isinstance(actuators, tuple) else (actuators,)
+        return dict(zip(self.task.motors, motors, strict=True))
 
 
-def _wrap(target: Any, name: str | None) -> TaskEnvSource | None:  # noqa: ARG001 - see SourceKind
+def _wrap(target: object, name: str | None) -> TaskEnvSource | None:  # noqa: ARG001 - see SourceKind
     """Return the source of a task, which is registered; None for other objects."""
     return TaskEnvSource(register(target)) if isinstance(target, Task) else None
 

@@ -1,20 +1,19 @@
 """A Gymnasium `VectorEnv` of thousands of environments that compiled code steps together."""
 
-import functools
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from codrl_mj.boundary import Argument, AttributeValue, Info, Options, PickledState
 from codrl_mj.envs.attributes import GymnasiumAttributes, is_shared, read, validate_states, write
 from codrl_mj.envs.compiled import Kernels, VectorStep, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.randomization import RandomizationState, apply_to_batch
 from codrl_mj.envs.setup import set_up_many, task_config
 from codrl_mj.envs.snapshots import check_snapshot
+from codrl_mj.envs.task_bank import TaskBank
 from codrl_mj.fields import free_memory
 from codrl_mj.physics import Signals
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
@@ -38,7 +37,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
     """
 
     # Class attribute, as in Gymnasium; an instance replaces it and never changes it.
-    metadata: dict[str, Any] = {  # noqa: RUF012
+    metadata: Info = {  # noqa: RUF012
         "render_modes": ["rgb_array", "rgb_array_list"],
         "render_fps": 50,
     }
@@ -47,7 +46,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self,
         num_envs: int,
         task: str | EnvConfig,
-        actuator: Any = None,
+        actuator: object = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         num_threads: int = 0,
@@ -56,7 +55,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         height: int = 480,
         camera: str = "fixed",
         pretty: bool = False,
-        **arguments: Any,
+        **arguments: Argument,
     ) -> None:
         """Build the environments.
 
@@ -106,6 +105,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             )
         self.setup, actuators = set_up_many(config, self.num_envs, actuator)
         self.physics = MujocoBatchPhysics(self.setup.simulation, actuators, int(num_threads))
+        self.bank = TaskBank(self.setup, self.physics, actuators)
+        """The actuators of all environments: their commands, draws, sensors and signals."""
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
             **self.metadata,
@@ -114,16 +115,13 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         }
         self.render_mode = render_mode
         self.max_episode_steps = max_episode_steps
-        self.single_action_space = self.setup.commands.action_space
+        self.single_action_space = self.bank.action_space
         self.single_observation_space = self.setup.observation_space
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.arm_radii = np.array([motor.arm_radius for motor in self.setup.config.actuators])
         """Arms of the motors of an environment [m], shape (motors,)."""
         self._streams = Streams(self.num_envs)
-        self._randomization_state = RandomizationState(
-            self.setup.randomization, actuators, functools.partial(apply_to_batch, self.physics)
-        )
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._ended = np.zeros(self.num_envs, dtype=bool)
         self._observations: Array = np.zeros(self.observation_space.shape or (), dtype=np.float32)
@@ -149,10 +147,10 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         return self.physics.state
 
     @state.setter
-    def state(self, states: Any) -> None:
+    def state(self, states: object) -> None:
         self.physics.state = validate_states(states, self.physics.state.shape)
 
-    def get_attr(self, name: str) -> tuple[Any, ...]:
+    def get_attr(self, name: str) -> tuple[AttributeValue, ...]:
         """Return an attribute for each environment, as Gymnasium's `SyncVectorEnv` does."""
         value = getattr(self, name)
         is_array_of_envs = isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,)
@@ -162,22 +160,22 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             else (value,) * self.num_envs
         )
 
-    def set_attr(self, name: str, values: Any) -> None:
+    def set_attr(self, name: str, values: Options) -> None:
         """Set an attribute of all environments; a list or tuple has one value for each."""
         setattr(self, name, np.array(values) if isinstance(values, list | tuple) else values)
 
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+    def call(self, name: str, *args: Argument, **kwargs: Argument) -> tuple[AttributeValue, ...]:
         """Return an attribute for each environment; call a method once for all of them."""
         value = getattr(self, name)
         return (value(*args, **kwargs),) * self.num_envs if callable(value) else self.get_attr(name)
 
-    def _read_attribute(self, name: str) -> Any:
+    def _read_attribute(self, name: str) -> AttributeValue:
         """Return one value if the environments share it, otherwise an array (N,)."""
         if is_shared(self.task.attributes[name]):
             return read(name, self.setup, self.physics.model)
         return np.array([read(name, self.setup, model) for model in self.physics.models()])
 
-    def _write_attribute(self, name: str, value: Any) -> None:
+    def _write_attribute(self, name: str, value: AttributeValue) -> None:
         """Write one value for all environments, or an array (N,) with one for each."""
         if is_shared(self.task.attributes[name]):
             if not np.array_equal(value, present := self._read_attribute(name)):
@@ -216,19 +214,19 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
     @property
     def randomization(self) -> dict[str, Array]:
         """Drawn values of the present episodes, path -> array (N,), and the number `rejected`."""
-        return self._randomization_state.drawn_values()
+        return self.bank.randomization.drawn_values()
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """Generators of the environments."""
         return tuple(self._streams.generators)
 
-    def reset(  # type: ignore[override]
+    def reset(
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[Array, dict[str, Any]]:
+        options: Info | None = None,
+    ) -> tuple[Array, Info]:
         """Start episodes in all environments, or in those of `options["reset_mask"]`.
 
         Args:
@@ -269,7 +267,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         infos = self._restart(rows, options or None)
         return self._observations.copy(), infos
 
-    def _restart(self, rows: Array, options: dict[str, Any] | None) -> dict[str, Any]:
+    def _restart(self, rows: Array, options: Info | None) -> Info:
         """Start episodes in some environments, and write `_observations`.
 
         Returns:
@@ -278,16 +276,15 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         low, high = self.setup.task.bounds(options) if options else self.setup.initial_bounds
         draws = low + (high - low) * self._streams.random(rows, len(low))
         states = self.setup.task.initial_states(draws)
-        self._randomization_state.draw(self._streams.random, rows)
-        self.physics.reset(
-            rows, states, self.setup.keys(lambda count: self._streams.random(rows, count))
-        )
+        self.bank.randomization.draw(self._streams.random, rows)
+        keys = self.bank.keys(lambda count: self._streams.random(rows, count))
+        self.physics.reset(rows, states, keys)
         self.physics.observe(self._compiled()[0].observe_rows, rows, self._observations)
         self._elapsed[rows] = 0
         self._ended[rows] = False
-        return self._randomization_state.infos(rows)
+        return self.bank.randomization.infos(rows)
 
-    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Info]:
         """Advance every environment by one step.
 
         Args:
@@ -305,7 +302,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
                 `reset(options={"reset_mask": ...})`.
             RuntimeError: in `DISABLED` mode, an environment whose episode ended was not reset.
         """
-        forces = self.setup.commands.forces(actions)
+        forces = self.bank.forces(actions)
         if len(forces) != self.num_envs:
             raise ValueError(
                 f"actions: got {len(forces)} rows for {self.num_envs} environments; give one for"
@@ -329,7 +326,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             steps.truncated.copy(),
         )
         columns = steps.signals.reshape(-1, *forces.shape).copy()
-        self.signals = signals = self.setup.signals([forces, *columns], forces)
+        self.signals = signals = self.bank.signals([forces, *columns], forces)
         if has_diverged:
             # `check_finite` raises. Record which episodes ended first, because they must still be
             # reset.
@@ -363,14 +360,14 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             self._kernels = compiled_kernels(self.setup, self.physics), steps
         return self._kernels
 
-    def _reset_ended(self, infos: dict[str, Any]) -> dict[str, Any]:
+    def _reset_ended(self, infos: Info) -> Info:
         """Reset environments whose episode ended; put their last data into the infos."""
         ended, rows = self._ended.copy(), np.flatnonzero(self._ended)
         final_obs = np.full(self.num_envs, None, dtype=object)
         for row, observation in zip(rows.tolist(), self._observations[rows], strict=True):
             final_obs[row] = observation
-        final_info: dict[str, Any] = {}
-        remaining: dict[str, Any] = {}
+        final_info: Info = {}
+        remaining: Info = {}
         for name in [name for name in infos if not name.startswith("_")]:
             final_info[name], final_info[f"_{name}"] = np.zeros_like(infos[name]), ended.copy()
             final_info[name][rows] = infos[name][rows]
@@ -389,16 +386,14 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
 
     def snapshot(self) -> dict[str, Array]:
         """Return the complete state as arrays: simulations, motors, generators, bookkeeping."""
-        state = {
+        return {
             "physics": self.physics.snapshot(),
             "streams": self._streams.state(),
             "elapsed": self._elapsed.copy(),
             "ended": self._ended.copy(),
             "observations": self._observations.copy(),
+            **self.bank.snapshot(),
         }
-        if self.physics.memory.size:
-            state["disturbances"] = self.physics.memory.copy()
-        return state | self._randomization_state.snapshot()
 
     def restore(self, snapshot: Mapping[str, Array]) -> None:
         """Continue from a snapshot, bit for bit.
@@ -407,21 +402,19 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             ValueError: the snapshot is of another number of environments, or of another task.
         """
         check_snapshot(snapshot, self.snapshot())
-        self._randomization_state.restore(snapshot)
+        self.bank.restore(snapshot)
         self.physics.restore(snapshot["physics"])
         self._streams.set_state(snapshot["streams"])
         self._elapsed[:], self._ended[:] = snapshot["elapsed"], snapshot["ended"]
         self._observations[:] = snapshot["observations"]
         # The last step's signals are not part of a snapshot.
         self.signals = None
-        if self.physics.memory.size:
-            self.physics.memory[:] = snapshot["disturbances"]
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> PickledState:
         """Return all but the renderer and the compiled step; a copy makes new ones."""
         return self.__dict__ | {"_renderer": None, "_kernels": None}
 
-    def render(self) -> tuple[Array, ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[Array, ...] | None:
         """Return images (height, width, 3), uint8, of all environments; None if not rendered."""
         images = [self.image(row) for row in range(self.num_envs if self.render_mode else 1)]
         return None if images[0] is None else tuple(images)  # type: ignore[arg-type]
@@ -436,13 +429,13 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         if self._renderer is None:
             self._renderer = OffscreenRenderer(self.physics.model, **self._view)  # type: ignore[arg-type]
         write_fields(
-            self.physics.model, self._randomization_state.model_fields(np.array([row]), shown=True)
+            self.physics.model, self.bank.randomization.model_fields(np.array([row]), shown=True)
         )
         write_fields(self.physics.model, self.model_fields, row)
         self.physics.show(row)
         return self._renderer.render(self.physics.data)
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: Argument) -> None:
         """Free the OpenGL context."""
         del kwargs
         if self._renderer is not None:
@@ -469,12 +462,12 @@ def check_counts(num_envs: int, max_episode_steps: int | None, bytes_per_env: in
         )
 
 
-def _vector_infos(signals: Signals, stepping: Array) -> dict[str, Any]:
+def _vector_infos(signals: Signals, stepping: Array) -> Info:
     """Return the signals as Gymnasium's vector infos: 0 and masked where no step was taken."""
     if not stepping.any():
         return {}
     reset_rows = np.flatnonzero(~stepping)
-    infos: dict[str, Any] = {}
+    infos: Info = {}
     for name, values in signals.items():
         infos[name] = values
         if len(reset_rows):

@@ -9,19 +9,65 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-import gymnasium
 import numpy as np
-from gymnasium import spaces
 
-from codrl_mj.actuators import IDEAL, actuator_from_mapping, allow_imports, mapping_of
-from codrl_mj.envs.config import EnvConfig
+from codrl_mj.actuators import (
+    IDEAL,
+    ActuatorModel,
+    actuator_from_mapping,
+    allow_imports,
+    mapping_of,
+)
+from codrl_mj.boundary import Action, Info
+from codrl_mj.envs.config import Env, EnvConfig, Space
 from codrl_mj.fields import check_memory
 from codrl_mj.runs.files import atomic_write, select_prefix
-from codrl_mj.runs.policies import Policy, check_spaces
+from codrl_mj.runs.policies import Policy as Policy
+from codrl_mj.runs.policies import check_spaces
 
-MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
+MakeEnv = Callable[[], Env]
+
+
+class Recorder(Protocol):
+    """Recorder of an environment's last step: the environment itself, or a `SubstepRecorder`."""
+
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """Names of the actuators' signals in `info`."""
+
+    @property
+    def trace_names(self) -> tuple[str, ...]:
+        """Names of the columns of `trace`."""
+
+    @property
+    def step_duration(self) -> float:
+        """Duration of an environment step [s]."""
+
+    @property
+    def command(self) -> str:
+        """Quantity that the agent commands: `force`, `current` or `voltage`."""
+
+    @property
+    def motor_names(self) -> tuple[str, ...]:
+        """Names of the motors."""
+
+    @property
+    def actuator(self) -> ActuatorModel | tuple[ActuatorModel, ...]:
+        """Actuator of the present episode; for several motors a tuple."""
+
+    @property
+    def state(self) -> np.ndarray:
+        """Mechanical state, shape (k,)."""
+
+    @property
+    def speeds(self) -> np.ndarray:
+        """Speeds of the shafts [m/s or rad/s], shape (motors,)."""
+
+    @property
+    def trace(self) -> np.ndarray:
+        """Signals after each integration step of the last step, shape (n, motors, columns)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +99,7 @@ class Episode:
     """
     terminated: bool
     """True if the task ended the episode. If False, the time limit did."""
-    actuator: Any
+    actuator: ActuatorModel | tuple[ActuatorModel, ...]
     """Actuator of the episode, after randomization; with several motors a tuple."""
     command: str = "force"
     """Quantity that the agent commands: `force`, `current` or `voltage`."""
@@ -63,7 +109,7 @@ class Episode:
     """Final `is_success` or `success` in `info`; None if the environment has neither."""
 
     @property
-    def actuators(self) -> tuple[Any, ...]:
+    def actuators(self) -> tuple[ActuatorModel, ...]:
         """Actuators of the episode, always as a tuple."""
         return self.actuator if isinstance(self.actuator, tuple) else (self.actuator,)
 
@@ -95,7 +141,7 @@ class Episode:
 class RandomPolicy:
     """Policy that samples uniformly from an action space."""
 
-    def __init__(self, actions: str | spaces.Space[Any], seed: int = 0) -> None:
+    def __init__(self, actions: str | Space, seed: int = 0) -> None:
         """Seed a private copy of the action space.
 
         Args:
@@ -117,7 +163,7 @@ class RandomPolicy:
         observation: np.ndarray,
         *,
         deterministic: bool = False,  # noqa: ARG002 - required by the Policy protocol
-    ) -> tuple[np.ndarray, Any]:
+    ) -> tuple[np.ndarray, None]:
         """Return one random action for each observation; `deterministic` is ignored."""
         return np.array([self._space.sample() for _ in observation]), None
 
@@ -139,6 +185,7 @@ def save_episode(episode: Episode, path: Path) -> None:
     """
     if path.suffix != ".npz":
         raise ValueError(f"trajectory {path}: the suffix must be .npz")
+    # NumPy converts arrays, flags and names alike.
     arrays: dict[str, Any] = {
         field: getattr(episode, field) for field in (*_ARRAYS, "terminated", "command")
     }
@@ -148,10 +195,9 @@ def save_episode(episode: Episode, path: Path) -> None:
         arrays["motors"] = episode.motors
     if episode.succeeded is not None:
         arrays["succeeded"] = episode.succeeded
-    has_several = isinstance(episode.actuator, tuple)
     descriptions = (
         [mapping_of(actuator) for actuator in episode.actuator]
-        if has_several
+        if isinstance(episode.actuator, tuple)
         else mapping_of(episode.actuator)
     )
     with atomic_write(path) as temporary:
@@ -219,20 +265,20 @@ def check_episodes(episodes: int, name: str = "episodes") -> None:
 class _Recording:
     """Environment and the recording of its episode."""
 
-    def __init__(self, env: gymnasium.Env[Any, Any], seed: int) -> None:
+    def __init__(self, env: Env, seed: int) -> None:
         """Reset the environment."""
         self.env = env
-        self._recorder: Any = env.get_wrapper_attr("recorder")
+        self._recorder: Recorder = env.get_wrapper_attr("recorder")
         self.observations = [env.reset(seed=seed)[0]]
         self._states = [self._recorder.state]
         self._first_speeds = self._recorder.speeds
-        self._actions: list[Any] = []
+        self._actions: list[Action] = []
         self._rewards: list[float] = []
         self._traces: list[np.ndarray] = []
-        self._signals: list[dict[str, Any]] = []
+        self._signals: list[Info] = []
         self._terminated = False
 
-    def step(self, action: Any) -> bool:
+    def step(self, action: Action) -> bool:
         """Take a step; return True if the episode has ended."""
         observation, reward, self._terminated, truncated, info = self.env.step(action)
         self.observations.append(observation)
@@ -273,7 +319,7 @@ class _Recording:
         )
 
 
-def check_policy(policy: Any, env: Any, same_bounds: bool = False) -> None:
+def check_policy(policy: Policy, env: Env, same_bounds: bool = False) -> None:
     """Raise ValueError if a policy was trained with other observations or actions.
 
     A space that the policy does not have is not compared. Other bounds of currents or voltages

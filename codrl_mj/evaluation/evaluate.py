@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Drive, Ideal, shaft
-from codrl_mj.envs.config import check_time_limit, find_source
+from codrl_mj.boundary import Json
+from codrl_mj.envs.config import EnvConfig, check_time_limit, find_source
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import (
     Interval,
@@ -25,12 +26,17 @@ from codrl_mj.evaluation.measures import (
     sign_changes,
     wilson_rate,
 )
+from codrl_mj.fields import DeclaredField
 from codrl_mj.runs.policies import Policy
 from codrl_mj.tasks import Task
 
 
-def _measure(label: str, unit: str) -> Any:
+def _measure(label: str, unit: str) -> DeclaredField:
     return dataclasses.field(metadata={"label": label, "unit": unit})
+
+
+Measures = dict[str, float | Interval | None]
+"""Measure of motors -> value, under the names of the fields of `Evaluation`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,10 +119,10 @@ class Evaluation:
     """Time to the goal of each episode [s]; None if it failed, 0 if the goal is to survive."""
     motors: Mapping[str, Mapping[str, float | None]] = dataclasses.field(default_factory=dict)
     """Measures of each of several motors: name -> measure -> value; energies are episode means."""
-    conditions: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    conditions: Mapping[str, Json] = dataclasses.field(default_factory=dict)
     """Conditions of the evaluation (environment, seed, ...), as JSON-serializable values."""
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> dict[str, Json]:
         """Return the evaluation as JSON-serializable values.
 
         An interval becomes a mapping with `mean`, `low` and `high`, quartiles one with `median`,
@@ -135,7 +141,7 @@ class Evaluation:
         return named | {"units": {name: field.metadata["unit"] for name, field in MEASURES.items()}}
 
 
-MEASURES: dict[str, dataclasses.Field[Any]] = {
+MEASURES: dict[str, dataclasses.Field[object]] = {
     field.name: field for field in dataclasses.fields(Evaluation) if "unit" in field.metadata
 }
 """Measures of `Evaluation`: the fields whose `metadata` has a `label` and a `unit`."""
@@ -143,7 +149,7 @@ MEASURES: dict[str, dataclasses.Field[Any]] = {
 
 def evaluate(
     policy: Policy,
-    env: Any,
+    env: EnvConfig,
     episodes: int = 100,
     seed: int = 0,
     deterministic: bool = True,
@@ -196,6 +202,8 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
         _measures(episodes, [[traces[motor_index]] for traces in traces_by_episode])
         for motor_index, _ in enumerate(episodes[0].motors)
     )
+    # Each measure has the type of its field.
+    measures: dict[str, Any] = {**_measures(episodes, traces_by_episode)}
     return Evaluation(
         task=env_source.name,
         episodes=len(episodes),
@@ -217,11 +225,11 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
         motors={
             name: {
                 key: value.mean if isinstance(value, Interval) else value
-                for key, value in measures.items()
+                for key, value in motor_measures.items()
             }
-            for name, measures in zip(episodes[0].motors, each_motor, strict=True)
+            for name, motor_measures in zip(episodes[0].motors, each_motor, strict=True)
         },
-        **_measures(episodes, traces_by_episode),
+        **measures,
     )
 
 
@@ -325,7 +333,7 @@ def motor_traces(episode: Episode) -> list[MotorTrace]:
 
 def _measures(
     episodes: Sequence[Episode], traces_by_episode: Sequence[Sequence[MotorTrace]]
-) -> dict[str, Any]:
+) -> Measures:
     """Return the measures of the same motors in every episode, averaged over the motors.
 
     They describe how well the torque follows the command (which is held over an environment step),
@@ -336,7 +344,7 @@ def _measures(
     tracked = [
         [trace for trace in traces if trace.is_torque_controlled] for traces in traces_by_episode
     ]
-    tracking: dict[str, Any] = dict.fromkeys(
+    tracking: Measures = dict.fromkeys(
         ("tracking_rms", "tracking_percent", "tracking_max", "tracking_lag")
     )
     if all(tracked):
@@ -371,7 +379,7 @@ def _root_mean_square(values: np.ndarray) -> float:
 
 def _electrical(
     episodes: Sequence[Episode], traces_by_episode: Sequence[Sequence[MotorTrace]]
-) -> dict[str, Any]:
+) -> Measures:
     """Return the measures of non-ideal actuators and windings; None where signals are missing."""
     signal_names = (f"{limit}_saturated" for limit in ("voltage", "current", "temperature"))
     limits = {f"{name}_percent": name for name in ("saturated", *signal_names)}
@@ -383,7 +391,7 @@ def _electrical(
         "peak_temperature",
         "energy_drawn",
     )
-    measures: dict[str, Any] = dict.fromkeys(
+    measures: Measures = dict.fromkeys(
         (*limits, *names, "energy_returned", "copper_loss", "magnetic_energy")
     )
     all_traces = [
@@ -441,6 +449,7 @@ def _energies(trace: MotorTrace) -> tuple[float, float, float, float, float]:
     # of the current do not give the energies. The drive integrates them within each step.
     if isinstance(trace.actuator, Drive):
         heat = trace.signals["copper_loss"] * trace.timestep
+        # The formula for one temperature also holds for an array of them.
         temperature: Any = trace.signals["temperature"]
         warm_resistance = shaft.resistance_at(trace.actuator.motor, temperature)
         drawn, returned = drawn_and_returned(trace.signals["electrical_power"] * trace.timestep)

@@ -179,7 +179,8 @@ def _parabolas(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _sums_between(values: np.ndarray, begins: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Return the sums of values[begin:end] for arrays of bounds."""
     sums = np.concatenate([[0.0], np.cumsum(values)])
-    return sums[ends] - sums[begins]
+    totals: np.ndarray = sums[ends] - sums[begins]
+    return totals
 
 
 def electrical_energy(

@@ -5,11 +5,11 @@ import contextvars
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 import mujoco
 
-from codrl_mj.actuators import ActuatorModel
+from codrl_mj.actuators import ActuatorModel, ActuatorSetting
+from codrl_mj.boundary import Argument
 from codrl_mj.engine.specs import add_motors, match_pattern, matchable_names, resolve_patterns
 from codrl_mj.envs.commands import commands_by_pattern
 from codrl_mj.envs.config import EnvConfig
@@ -136,7 +136,9 @@ def patcher_of(config: EnvConfig) -> ModelPatcher:
 
 @contextlib.contextmanager
 def motors_added(
-    actuators: Mapping[Any, Any], allow_unstable: bool = False, joint_dynamics: str | None = None
+    actuators: Mapping[str, ActuatorSetting],
+    allow_unstable: bool = False,
+    joint_dynamics: str | None = None,
 ) -> Iterator[None]:
     """Add motors to each environment that any library builds in a `with` block.
 
@@ -194,7 +196,7 @@ def _patched_loader(
 
     # MuJoCo's functions are replaced for all threads; the context variable restricts the motors to
     # the thread of the block.
-    def load(*arguments: Any, **options: Any) -> mujoco.MjModel:
+    def load(*arguments: Argument, **options: Argument) -> mujoco.MjModel:
         model, patcher = original(*arguments, **options), _ACTIVE_PATCHER.get()
         return (
             model

@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import dm_env
 import mujoco
@@ -13,8 +12,9 @@ from dm_env import specs
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel
+from codrl_mj.boundary import Action, Argument, AttributeValue, Info, Observation
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.motors import ActuatorBank
+from codrl_mj.envs.model_bank import ModelBank
 from codrl_mj.external_envs import check_dm_control
 from codrl_mj.external_envs.building import patcher_of
 from codrl_mj.external_envs.sources import ExternalEnvSource
@@ -58,22 +58,22 @@ class MotorsAddedEnvironment(dm_env.Environment):
             )
         self._generator = np.random.default_rng(noise_seed)
         self._ended = True
-        self._bound: tuple[mujoco.MjModel, ActuatorBank] | None = None
+        self._bound: tuple[mujoco.MjModel, ModelBank] | None = None
         # If the motors do not fit the environment, the property raises now and not at the first
         # step.
-        _ = self._bank
+        _ = self.bank
 
     def reset(self) -> dm_env.TimeStep:
         """Start an episode, with the motors at rest; composer environments rebuild their model."""
         if self._config.randomize is not None:
-            self._bank.randomization_state.draw_single(self._generator)
+            self.bank.randomization.draw_single(self._generator)
         with self._patcher.patch_model_loading():
             timestep = self._environment.reset()
         self._ended = False
-        self._bank.begin(self._generator)
+        self.bank.begin(self._generator)
         return timestep
 
-    def step(self, action: Any) -> dm_env.TimeStep:
+    def step(self, action: Action) -> dm_env.TimeStep:
         """Advance by one environment step; the step after the end of an episode resets.
 
         Raises:
@@ -83,7 +83,7 @@ class MotorsAddedEnvironment(dm_env.Environment):
         """
         if self._ended:
             return self.reset()
-        bank, time = self._bank, self.mujoco[1].time
+        bank, time = self.bank, self.mujoco[1].time
         try:
             with self._patcher.patch_model_loading():
                 timestep = self._environment.step(bank.controls(action))
@@ -95,7 +95,7 @@ class MotorsAddedEnvironment(dm_env.Environment):
         return timestep
 
     @property
-    def _bank(self) -> ActuatorBank:
+    def bank(self) -> ModelBank:
         """Motors of the present model, which changes when the environment rebuilds it."""
         model, data = self.mujoco
         if self._bound is None or self._bound[0] is not model:
@@ -104,27 +104,27 @@ class MotorsAddedEnvironment(dm_env.Environment):
                 np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum)
             )
             actions = spaces.Box(low, high, dtype=np.float64)
-            bank = ActuatorBank(data, self._config, actions, self._environment.control_timestep())
+            bank = ModelBank(data, self._config, actions, self._environment.control_timestep())
             self._bound = model, bank
         return self._bound[1]
 
     @property
     def motors(self) -> dict[int, ActuatorModel]:
         """Actuator index in the model -> motor of the present episode."""
-        return dict(self._bank.motors)
+        return dict(self.bank.motors)
 
     @property
-    def randomization(self) -> dict[str, Any]:
+    def randomization(self) -> Info:
         """Drawn values of the present episode; empty if nothing is randomized."""
-        return self._bank.randomization_state.report()
+        return self.bank.randomization.report()
 
-    def signals(self) -> dict[str, Any]:
+    def signals(self) -> Info:
         """Return the motors' signals after the last step, as in `info` of `codrl_mj.make`.
 
         `desired_force` and `actual_force` [N or N*m], the signals of the families and `saturated`;
         for several motors arrays (n_motors,) in the model's order.
         """
-        return self._bank.signals()
+        return self.bank.signals()
 
     @property
     def mujoco(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -132,23 +132,24 @@ class MotorsAddedEnvironment(dm_env.Environment):
         physics = self._environment.physics
         return physics.model.ptr, physics.data.ptr
 
-    def observation_spec(self) -> Any:
+    def observation_spec(self) -> Observation:
         """Return the environment's observation specification."""
         return self._environment.observation_spec()
 
-    def action_spec(self) -> Any:
+    def action_spec(self) -> specs.BoundedArray:
         """Return the action specification, with the limits of the motors' commands."""
         spec = self._environment.action_spec()
         if self._config.action == "force":
             return spec
-        space: Any = self._bank.action_space
+        space = self.bank.action_space
+        assert isinstance(space, spaces.Box)
         return specs.BoundedArray(spec.shape, spec.dtype, space.low, space.high, spec.name)
 
-    def reward_spec(self) -> Any:
+    def reward_spec(self) -> specs.Array:
         """Return the environment's reward specification."""
         return self._environment.reward_spec()
 
-    def discount_spec(self) -> Any:
+    def discount_spec(self) -> specs.BoundedArray:
         """Return the environment's discount specification."""
         return self._environment.discount_spec()
 
@@ -156,7 +157,7 @@ class MotorsAddedEnvironment(dm_env.Environment):
         """Close the environment."""
         self._environment.close()
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> AttributeValue:
         """Return any other attribute from the wrapped environment, such as `physics` or `task`."""
         if name.startswith("__") or name == "_environment":
             raise AttributeError(name)
@@ -165,15 +166,15 @@ class MotorsAddedEnvironment(dm_env.Environment):
 
 def make_dm_control(
     environment: str | Callable[..., dm_env.Environment],
-    actuators: Mapping[Any, Any],
+    actuators: Mapping[str, object],
     *,
     action: str = "force",
-    randomize: Mapping[str, Any] | None = None,
-    disturbances: Any = None,
+    randomize: Mapping[str, object] | None = None,
+    disturbances: object = None,
     allow_unstable: bool = False,
     joint_dynamics: str | None = None,
     noise_seed: int | None = None,
-    **options: Any,
+    **options: Argument,
 ) -> MotorsAddedEnvironment:
     """Create an environment of dm_control, or another `dm_env.Environment`, with motors.
 
@@ -200,7 +201,7 @@ def make_dm_control(
         RuntimeError: dm_control does not work with the installed MuJoCo.
     """
     check_dm_control()
-    creator: Callable[..., Any]
+    creator: Callable[..., dm_env.Environment]
     if not isinstance(environment, str) and not callable(environment):
         raise ValueError(
             f"environment = {environment!r}: must be DOMAIN/TASK, or a function that makes an"
@@ -218,7 +219,7 @@ def make_dm_control(
                 " DOMAIN/TASK of dm_control.suite.ALL_TASKS, or a function"
             )
         name, creator = environment, functools.partial(suite.load, domain, task)
-    settings: dict[str, Any] = {"randomize": randomize, "disturbances": disturbances}
+    settings: Info = {"randomize": randomize, "disturbances": disturbances}
     config = EnvConfig(
         ExternalEnvSource(name, creator),
         actuators,

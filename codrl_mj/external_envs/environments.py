@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium
 import mujoco
@@ -16,9 +16,11 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 
 from codrl_mj.actuators import ActuatorModel
+from codrl_mj.boundary import Action, Argument, Info, Observation, PickledState
 from codrl_mj.engine.reading import bring_to_rest, motor_slots, motors
+from codrl_mj.envs.bank import extend_space
 from codrl_mj.envs.config import Env, EnvConfig
-from codrl_mj.envs.motors import ActuatorBank, extend_space
+from codrl_mj.envs.model_bank import ModelBank
 from codrl_mj.envs.recording import SubstepRecorder
 from codrl_mj.envs.snapshots import (
     check_snapshot,
@@ -34,7 +36,7 @@ from codrl_mj.physics.streams import generator_words
 
 
 def make_with_motors(
-    spec: EnvSpec, creator: Callable[..., Env], config: EnvConfig, **options: Any
+    spec: EnvSpec, creator: Callable[..., Env], config: EnvConfig, **options: Argument
 ) -> "MotorsAddedEnv":
     """Create a Gymnasium environment with motors.
 
@@ -59,7 +61,7 @@ def make_with_motors(
 class MotorsAddedCreator:
     """Callable that makes an environment with motors, in place of the original entry point."""
 
-    creator: Any
+    creator: Callable[..., Env]
     """Original class or function, which makes the environment without motors."""
     config: EnvConfig
     """Settings of the motors."""
@@ -67,12 +69,13 @@ class MotorsAddedCreator:
     """Id of the environment, for messages."""
 
     @property
-    def metadata(self) -> dict[str, Any]:
+    def metadata(self) -> Info:
         """Metadata of the environment, which `gymnasium.make` reads."""
         # A plain function has none; Gymnasium handles the AttributeError.
-        return self.creator.metadata
+        metadata: Info = self.creator.metadata  # type: ignore[attr-defined]
+        return metadata
 
-    def __call__(self, **options: Any) -> gymnasium.Env:
+    def __call__(self, **options: Argument) -> gymnasium.Env:
         """Make the environment."""
         patcher = patcher_of(self.config)
         # An error of a registered id names the id already.
@@ -83,7 +86,9 @@ class MotorsAddedCreator:
             env = self.creator(**options)
         _check_env(env, self.env_id)
         patcher.check(self.env_id, f"env = {self.env_id}: " if is_function else "")
+        # Attributes are set that only Gymnasium's MujocoEnv has.
         base: Any = env.unwrapped
+        # mypy takes no class for hashable whose instances are not.
         env_class: Any = type(base)
         # The class of the existing object is replaced, because only the original creator, which may
         # be a function, knows the class and the wrappers around it.
@@ -94,12 +99,14 @@ class MotorsAddedCreator:
             )
         return env
 
-    def make_unwrapped(self, **options: Any) -> gymnasium.Env:
+    def make_unwrapped(self, **options: Argument) -> gymnasium.Env:
         """Make the environment, without wrappers."""
         return self(**options).unwrapped
 
 
-def _check_arguments(creator: Any, options: Mapping[str, Any], name: str) -> None:
+def _check_arguments(
+    creator: Callable[..., Env], options: Mapping[str, Argument], name: str
+) -> None:
     """Raise ValueError if a function cannot be called with these options."""
     try:
         signature = inspect.signature(creator)
@@ -116,7 +123,7 @@ def _check_arguments(creator: Any, options: Mapping[str, Any], name: str) -> Non
         ) from None
 
 
-def _check_env(env: Any, name: str) -> None:
+def _check_env(env: object, name: str) -> None:
     """Raise ValueError if the result of a creator cannot get motors."""
     if isinstance(env, gymnasium.Env):
         layers = [env]
@@ -147,15 +154,15 @@ def _check_env(env: Any, name: str) -> None:
 
 
 @functools.cache
-def _class_with_motors(env_class: Any) -> Any:
+def _class_with_motors(env_class: type[MujocoEnv]) -> type[MujocoEnv]:
     """Return a subclass whose `set_state` brings the motors to rest, and whose copies have motors.
 
     Gymnasium's environments copy and pickle themselves by calling their constructor again, which
     would build the model without motors.
     """
 
-    class WithMotors(env_class):
-        recreate: Any = None
+    class WithMotors(env_class):  # type: ignore[misc, valid-type]
+        recreate: Callable[[], Env]
 
         @functools.cached_property
         def _slots(self) -> list[np.ndarray]:
@@ -166,7 +173,7 @@ def _class_with_motors(env_class: Any) -> Any:
                 bring_to_rest(slot, self.data.time, slot[1])
             super().set_state(qpos, qvel)
 
-        def __reduce__(self) -> Any:
+        def __reduce__(self) -> tuple[Callable[[], Env], tuple[()]]:
             return self.recreate, ()
 
     for name in ("__name__", "__qualname__", "__module__", "__doc__"):
@@ -203,27 +210,28 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
 
     def _bind(self) -> None:
         """Find the motors of the environment's model, and set the spaces."""
+        # `__init__` has checked that it has these attributes.
         base: Any = self.unwrapped
         self._recorder: SubstepRecorder | None = None
-        self._bank = ActuatorBank(
+        self.bank = ModelBank(
             base.data, self._config, self.env.action_space, getattr(base, "dt", None)
         )
-        if self._bank.action_space is not self.env.action_space:
-            self.action_space = self._bank.action_space
-        if self._bank.sensors:
+        if self.bank.action_space is not self.env.action_space:
+            self.action_space = self.bank.action_space
+        if self.bank.sensors:
             self.observation_space = extend_space(
-                self.env.observation_space, len(self._bank.sensors)
+                self.env.observation_space, len(self.bank.sensors)
             )
 
     @property
     def motors(self) -> dict[int, ActuatorModel]:
         """Actuator index in the model -> motor of the present episode."""
-        return dict(self._bank.motors)
+        return dict(self.bank.motors)
 
     @property
     def signal_names(self) -> tuple[str, ...]:
         """Names of the motors' signals in `info`."""
-        return tuple(self._bank.signals())
+        return self.bank.signal_names
 
     @property
     def recorder(self) -> SubstepRecorder:
@@ -231,40 +239,40 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         if self._recorder is None:
             dt = getattr(self.unwrapped, "dt", None)
             self._recorder = SubstepRecorder(
-                self._bank, self._config.action, dt if isinstance(dt, float) else None
+                self.bank, self._config.action, dt if isinstance(dt, float) else None
             )
         return self._recorder
 
     @property
     def sensor_names(self) -> tuple[str, ...]:
         """Names of the values that `observe_actuator` appends to the observation."""
-        return self._bank.sensors
+        return self.bank.sensors
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[Observation, Info]:
         """Start an episode, with the motors at rest; a seed also seeds the motors' generator."""
         if seed is not None:
             # The spawn key makes the motors' numbers independent of the environment's own.
             seed_sequence = np.random.SeedSequence(seed, spawn_key=(1,))
             self._generator = np.random.Generator(np.random.PCG64(seed_sequence))
-        self._bank.randomization_state.draw_single(self._generator)
+        self.bank.randomization.draw_single(self._generator)
         observation, info = self.env.reset(seed=seed, options=options)
         self._was_reset = True
-        self._bank.begin(self._generator)
+        self.bank.begin(self._generator)
         drawn_values = self.randomization
         return self._with_sensors(observation), info | (
             {"randomization": drawn_values} if drawn_values else {}
         )
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, SupportsFloat, bool, bool, Info]:
         """Advance by one environment step.
 
         Raises:
             ValueError: the shape of the action is not that of the action space.
             SimulationDivergedError: a value of the simulation is not finite.
         """
-        bank = self._bank
+        bank = self.bank
         time = bank.data.time
         controls = bank.controls(action)
         outcome = (
@@ -282,15 +290,15 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             info | bank.signals(),
         )
 
-    def _with_sensors(self, observation: Any) -> Any:
-        if not self._bank.sensors:
+    def _with_sensors(self, observation: Observation) -> Observation:
+        if not self.bank.sensors:
             return observation
-        return np.concatenate([observation, self._bank.sensor_values()]).astype(observation.dtype)
+        return np.concatenate([observation, self.bank.sensor_values()]).astype(observation.dtype)
 
     @property
-    def randomization(self) -> dict[str, Any]:
+    def randomization(self) -> Info:
         """Drawn values of the present episode, as in the reset's info; empty without draws."""
-        return self._bank.randomization_state.report()
+        return self.bank.randomization.report()
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays: simulation, motors, generators, draws, time limit.
@@ -302,14 +310,14 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         """
         return {
             "environment": encode_name(self._id),
-            **(state_of(self._bank.data) if self._has_known_state else {}),
+            **(state_of(self.bank.data) if self._has_known_state else {}),
             "generator": generator_words(self.unwrapped.np_random),
             "motors_generator": generator_words(self._generator),
             "elapsed_steps": elapsed_steps(self.env),
-            **self._bank.snapshot(),
+            **self.bank.snapshot(),
         }
 
-    def restore(self, snapshot: Mapping[str, np.ndarray]) -> Any:
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> Observation | None:
         """Continue from a snapshot, bit for bit, in an environment made with the same arguments.
 
         Returns:
@@ -320,12 +328,12 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         if not self._was_reset:
             self.env.reset()
             self._was_reset = True
-        self._bank.restore(snapshot)
+        self.bank.restore(snapshot)
         self.unwrapped.np_random = generator_from_words(snapshot["generator"])
         self._generator = generator_from_words(snapshot["motors_generator"])
         if not self._has_known_state:
             return self.reset()[0]
-        set_state_of(self._bank.data, snapshot["state"], snapshot["computed"])
+        set_state_of(self.bank.data, snapshot["state"], snapshot["computed"])
         set_elapsed_steps(self.env, snapshot["elapsed_steps"])
         return None
 
@@ -338,15 +346,15 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         """True if MuJoCo's data contain the environment's whole state."""
         return isinstance(self.unwrapped, MujocoEnv)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> PickledState:
         """Return all attributes except those tied to the model, which a copy builds again."""
         return {
             name: value
             for name, value in self.__dict__.items()
-            if name not in ("_bank", "_recorder")
+            if name not in ("bank", "_recorder")
         }
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: PickledState) -> None:
         """Restore in this or another process; the copy must then be reset, as in Gymnasium."""
         self.__dict__.update(state, _was_reset=False)
         base = self.unwrapped

@@ -7,14 +7,22 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import gymnasium
-from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from codrl_mj.actuators import IDEAL, ActuatorModel
-from codrl_mj.envs.config import SOURCE_KINDS, Env, EnvConfig, EnvSource, SourceKind, VecEnv
+from codrl_mj.boundary import Argument, Info, Options
+from codrl_mj.envs.config import (
+    SOURCE_KINDS,
+    Env,
+    EnvConfig,
+    EnvSource,
+    SourceKind,
+    Space,
+    StoredActuators,
+    VecEnv,
+)
 from codrl_mj.envs.patterns import actuators_by_pattern
 from codrl_mj.user_code import load_module
 
@@ -66,7 +74,7 @@ class ExternalEnvSource(EnvSource):
         spec_id = re.sub(r"[^\w:.-]", "", self.name) or "environment"
         return EnvSpec(spec_id, self._creator, max_episode_steps=self.time_limit)
 
-    def make(self, config: EnvConfig, **arguments: Any) -> Env:
+    def make(self, config: EnvConfig, **arguments: Argument) -> Env:
         """Make an environment with `gymnasium.make`, and with motors.
 
         Raises:
@@ -80,7 +88,7 @@ class ExternalEnvSource(EnvSource):
                 self.spec, self.creator, config, **(settings | config.options | arguments)
             )
 
-    def make_vec(self, config: EnvConfig, num_envs: int, **arguments: Any) -> VecEnv:
+    def make_vec(self, config: EnvConfig, num_envs: int, **arguments: Argument) -> VecEnv:
         """Make a vector environment that steps its environments one by one."""
         from codrl_mj.envs.serial import VECTOR_ARGUMENTS, SerialVectorEnv
 
@@ -90,12 +98,12 @@ class ExternalEnvSource(EnvSource):
         make = functools.partial(config.build, **arguments)
         return SerialVectorEnv(num_envs, make, bytes_per_env=BYTES_PER_ENV, **vector_arguments)
 
-    def action_space(self, config: EnvConfig) -> "spaces.Space[Any]":
+    def action_space(self, config: EnvConfig) -> Space:
         """Return the action space of the environment without motors."""
         with self._with_name_in_errors(config):
             return _action_space(self, json.dumps(config.options))
 
-    def actuators(self, actuator: Any) -> dict[str, ActuatorModel]:
+    def actuators(self, actuator: object) -> dict[str, ActuatorModel]:
         """Return the actuators as the configuration stores them: pattern -> `ActuatorModel`."""
         from codrl_mj.engine.specs import resolve_patterns
 
@@ -103,11 +111,12 @@ class ExternalEnvSource(EnvSource):
             actuators_by_pattern(actuator, self.default_actuator), f"the environment {self.name}"
         )
 
-    def actuators_by_name(self, actuators: Any) -> dict[str, ActuatorModel]:
+    def actuators_by_name(self, actuators: StoredActuators) -> dict[str, ActuatorModel]:
         """Return pattern -> actuator from the result of `actuators`."""
+        assert isinstance(actuators, Mapping)
         return dict(actuators)
 
-    def override_actuators(self, config: EnvConfig, patterns: Mapping[str, Any]) -> dict[str, Any]:
+    def override_actuators(self, config: EnvConfig, patterns: Mapping[str, object]) -> Info:
         """Return pattern -> actuator: `patterns`, and the configuration's for all other motors."""
         from codrl_mj.engine.reading import actuators_sharing_motor
         from codrl_mj.engine.specs import match_pattern, matchable_names
@@ -115,7 +124,7 @@ class ExternalEnvSource(EnvSource):
         if all(configured == IDEAL for configured in config.actuators):
             return dict(patterns)
         with contextlib.closing(config.build()) as env:
-            model: Any = env.unwrapped.model  # type: ignore[attr-defined]
+            model = env.unwrapped.model  # type: ignore[attr-defined]
             names = matchable_names(model)
         overridden = {index for pattern in patterns for index in match_pattern(pattern, names)}
         remaining = {
@@ -130,7 +139,7 @@ class ExternalEnvSource(EnvSource):
         }
         return {**remaining, **patterns}
 
-    def code(self, options: Any) -> set[str | Path]:
+    def code(self, options: Options) -> set[str | Path]:
         """Return the module of the creator, and files named in options."""
         module = getattr(self.creator, "__module__", "")
         return super().code(options) | ({module} if module else set())
@@ -186,14 +195,14 @@ class GymnasiumEnvSource(ExternalEnvSource):
         entry = self.spec.entry_point
         return load_env_creator(entry) if isinstance(entry, str) else entry  # type: ignore[return-value]
 
-    def code(self, options: Any) -> set[str | Path]:
+    def code(self, options: Options) -> set[str | Path]:
         """Return the modules of the class and of the registration, and files named in options."""
         module = self.name.rpartition(":")[0]
         return super().code(options) | ({module} if module else set())
 
 
 @functools.cache
-def _action_space(source: ExternalEnvSource, options: str) -> "spaces.Space[Any]":
+def _action_space(source: ExternalEnvSource, options: str) -> Space:
     """Return the action space without motors; options are JSON text, to be hashable."""
     env = gymnasium.make(source.spec, disable_env_checker=True, **json.loads(options))
     space = env.action_space
@@ -209,7 +218,7 @@ def _claims(name: str) -> bool:
     return _ID.fullmatch(name) is not None
 
 
-def _wrap(target: Any, name: str | None) -> ExternalEnvSource | None:
+def _wrap(target: object, name: str | None) -> ExternalEnvSource | None:
     """Return the source of a function or class that makes environments; None for other objects."""
     if not callable(target):
         return None

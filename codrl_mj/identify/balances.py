@@ -75,10 +75,11 @@ class Windows:
         if order not in self._weights:
             self._weights[order] = _PHI[order](self._phase) * (-1.0 / self.length) ** order
         weighted = values * self._weights[order]
-        return (
+        mean: np.ndarray = (
             np.sum(0.5 * self._steps * (weighted[:, 1:] + weighted[:, :-1]), axis=1)
             / self.length[:, 0]
         )
+        return mean
 
     def mean_held(self, signal: str, lag: float = 0.0) -> np.ndarray:
         """Return the weighted mean of a signal with a zero-order hold, shape (windows,).
@@ -94,7 +95,8 @@ class Windows:
         edges = [
             np.clip((time[rows + k] + lag - self.begin) / self.length, 0.0, 1.0) for k in (0, 1)
         ]
-        return np.sum(values[rows] * (_PHI[-1](edges[1]) - _PHI[-1](edges[0])), axis=1)
+        mean: np.ndarray = np.sum(values[rows] * (_PHI[-1](edges[1]) - _PHI[-1](edges[0])), axis=1)
+        return mean
 
 
 def regress(

@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from codrl_mj.actuators import GearMotor
 from codrl_mj.identify.balances import (
     Balance,
     effort_lag,
@@ -72,33 +73,35 @@ class LogFacts(NamedTuple):
     """A log to be checked, with values that several checks use."""
 
     log: Log
-    motor: Any  # the `GearMotor` of a datasheet, or None
+    motor: GearMotor | None  # motor of a datasheet
     rig: str | None
     effort: str  # logged torque, or else current, or else voltage; empty if there is none
     conditions: set[str]  # signals of the log, and conditions that it meets; see `check`
     winding: Balance | None  # R, L and kE from the voltage balance; None if it has no solution
 
 
-CHECKS: list[tuple[set[str], Callable[[LogFacts], Iterator[Finding]]]] = []
+Check = Callable[[LogFacts], Iterator[Finding]]
+"""Function that yields what it finds in a log."""
+CHECKS: list[tuple[set[str], Check]] = []
 """Conditions under which a check applies, and its function; checks run in this order."""
 
 
-def _needs(words: str) -> Callable[[Any], Any]:
+def _needs(words: str) -> Callable[[Check], Check]:
     """Return a decorator that registers a check with conditions, separated by spaces."""
 
-    def add(function: Any) -> Any:
+    def add(function: Check) -> Check:
         CHECKS.append(({*words.split()}, function))
         return function
 
     return add
 
 
-def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
+def check(log: Log, motor: GearMotor | None = None, rig: str | None = None) -> list[Finding]:
     """Return all findings about a log, errors first.
 
     Args:
         log: log, as read from its file.
-        motor: `GearMotor` of a datasheet to compare with; None skips the comparison.
+        motor: motor of a datasheet to compare with; None skips the comparison.
         rig: `pendulum`, `free` or `load`; None is treated as `pendulum`.
     """
     # The torque is nearest to the shaft; current and voltage act on the shaft through the winding.
@@ -608,9 +611,11 @@ def _two_constants(facts: LogFacts) -> Iterator[Finding]:
 def _datasheet(facts: LogFacts) -> Iterator[Finding]:
     """Compare the resistance and the back-EMF constant with the datasheet."""
     motor, balance = facts.motor, facts.winding
+    if motor is None or balance is None:
+        return
     constant = motor.back_emf_constant * motor.gear_ratio
     for name, value in (("resistance", motor.resistance), ("back_emf_constant", constant)):
-        if balance is None or balance.t_values.get(name, 0.0) <= _MIN_T_VALUE or value <= 0.0:
+        if balance.t_values.get(name, 0.0) <= _MIN_T_VALUE or value <= 0.0:
             continue
         logged = balance.values[name]
         if abs(math.log(logged / value)) > math.log(2.0):

@@ -6,7 +6,7 @@ import functools
 import math
 import re
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import cast
 
 import numpy as np
 
@@ -39,19 +39,24 @@ EXAMPLES = {
 _EXAMPLE = "time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad"
 
 
-def twos_complement(values: Any, bits: Any) -> Any:
+Operand = float | np.ndarray
+"""Value in a formula: a constant, or a column."""
+
+
+def twos_complement(values: Operand, bits: float) -> np.ndarray:
     """Return unsigned numbers read as two's complement: 65535 with 16 bits is -1."""
     modulus = 2.0 ** float(bits)
-    return (np.asarray(values) + modulus / 2.0) % modulus - modulus / 2.0
+    signed: np.ndarray = (np.asarray(values) + modulus / 2.0) % modulus - modulus / 2.0
+    return signed
 
 
-def sign_magnitude(values: Any, bits: Any) -> Any:
+def sign_magnitude(values: Operand, bits: float) -> np.ndarray:
     """Return unsigned numbers read with a sign in the highest bit: 1324 with 11 bits is -300."""
     half = 2.0 ** (float(bits) - 1.0)
     return np.where(np.asarray(values) >= half, half - np.asarray(values), values)
 
 
-FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
+FUNCTIONS: dict[str, tuple[int, Callable[..., Operand]]] = {
     "twos_complement": (2, twos_complement),
     "sign_magnitude": (2, sign_magnitude),
     "unwrap": (2, lambda values, period: np.unwrap(values, period=float(period))),
@@ -64,8 +69,8 @@ FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
 
 A second argument must be a constant, except for atan2.
 """
-_Value = Callable[[Mapping[str, Any]], Any]
-_OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
+_Value = Callable[[Mapping[str, Operand]], Operand]
+_OPERATORS: dict[type, Callable[[Operand, Operand], Operand]] = {
     ast.Add: np.add,
     ast.Sub: np.subtract,
     ast.Mult: np.multiply,
@@ -115,8 +120,11 @@ class Column:
         """Names of the columns and constants that the formula reads."""
         return self._formula[1]
 
-    def evaluate(self, table: Mapping[str, Any]) -> Any:
-        """Return the signal in SI units, from a table of columns and constants."""
+    def evaluate(self, table: Mapping[str, Operand | None]) -> Operand:
+        """Return the signal in SI units, from a table of columns and constants.
+
+        Columns that the formula does not read may be None.
+        """
         for name in sorted(self.names - table.keys()):
             if width := sum(
                 bool(re.fullmatch(re.escape(name) + r"\[\d+\]", known)) for known in table
@@ -125,9 +133,10 @@ class Column:
                     f"{name} holds lists of {width} numbers; choose an entry, such as {name}[0]"
                 )
         check_names(self.names, table, "column")
+        operands = {name: value for name, value in table.items() if value is not None}
         # Rows without a finite value are left out later, with a finding.
         with np.errstate(divide="ignore", invalid="ignore"):
-            return self._quantity(self._formula[0]({"pi": math.pi, **table}))
+            return self._quantity(self._formula[0]({"pi": math.pi, **operands}))
 
     @functools.cached_property
     def _formula(self) -> tuple[_Value, set[str], bool]:
@@ -158,7 +167,9 @@ class Column:
                 )
                 listed = "{}[{}]".format(*parts)
                 return lambda table: table[listed], {listed}
-            case ast.Constant(value=number):
+            case ast.Constant(value=literal):
+                # For other literals than numbers, such as None, numpy raises an error.
+                number = cast("float", literal)
                 return lambda _: number, set()
             case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=inner):
                 value, names = self._compile(inner)
@@ -191,7 +202,7 @@ class Column:
             f"{type(node).__name__} is not allowed; write names, numbers, + - * / and {known}"
         )
 
-    def _quantity(self, value: Any) -> Any:
+    def _quantity(self, value: Operand) -> Operand:
         """Return a value in SI units."""
         kind, unit = COLUMN_UNITS[self.signal], self.unit
         if unit is None or (not kind and unit in ("", "1")):

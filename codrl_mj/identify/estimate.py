@@ -9,7 +9,7 @@ regardless of the number of segments.
 import abc
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -86,11 +86,15 @@ class Model(abc.ABC):
         """Return a function that simulates the output of a segment with parameters (p,)."""
 
 
+FittedModel = TypeVar("FittedModel", bound=Model)
+FittedModel_co = TypeVar("FittedModel_co", bound=Model, covariant=True)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(Generic[FittedModel_co]):
     """Fitted parameters, with the residuals and Jacobians from which their intervals follow."""
 
-    model: Any  # a `Model`
+    model: FittedModel_co
     segments: Sequence[Segment]
     values: np.ndarray  # free parameters, shape (p,)
     # Residuals above this scale, in standard deviations of the sensor, count as outliers.
@@ -102,7 +106,9 @@ class Fit:
     states: tuple[np.ndarray, ...]  # initial state of each segment
     logs: tuple[Log, ...] = ()  # logs of the segments, with the delay of the input removed
     delay: float = 0  # delay of the input [rows]
-    start_fits: tuple["Fit", ...] = ()  # short fits, one from each start, the best first
+    start_fits: tuple[
+        "Fit[FittedModel_co]", ...
+    ] = ()  # short fits, one from each start, the best first
 
     @property
     def cost(self) -> float:
@@ -125,13 +131,12 @@ def robust_cost(residuals: np.ndarray, scale: float) -> float:
 
 def _residuals(simulate: Simulate, segment: Segment, state: np.ndarray) -> np.ndarray:
     """Return the residuals in standard deviations of the sensor, shape (m,)."""
-    residuals = (simulate(segment, state) - segment.measured) / segment.deviation
+    residuals: np.ndarray = (simulate(segment, state) - segment.measured) / segment.deviation
     # A diverged simulation gets large finite residuals, from which the optimizer can step back.
-    return (
-        residuals
-        if residuals @ residuals < MAX_SQUARED_RESIDUALS
-        else np.clip(np.nan_to_num(residuals, nan=1e9), -1e9, 1e9)
-    )
+    if residuals @ residuals < MAX_SQUARED_RESIDUALS:
+        return residuals
+    clipped: np.ndarray = np.clip(np.nan_to_num(residuals, nan=1e9), -1e9, 1e9)
+    return clipped
 
 
 class _StateFit(NamedTuple):
@@ -266,11 +271,11 @@ def robust_scale(residuals: np.ndarray) -> float:
 
 
 def fit_from_starts(
-    model: Model,
+    model: FittedModel,
     segments: Sequence[Segment],
     starts: Sequence[np.ndarray],
     on_start: Callable[[], None] = lambda: None,
-) -> tuple[Fit, tuple[Fit, ...]]:
+) -> tuple[Fit[FittedModel], tuple[Fit[FittedModel], ...]]:
     """Return the best fit from several starts, and the short fits from all starts, best first."""
     fits = []
     for start in starts:
@@ -287,7 +292,7 @@ def fit_from_starts(
     # Costs are comparable only with the same scale.
     scale = min(start_fit.scale for start_fit in fits)
 
-    def cost(fit: Fit) -> float:
+    def cost(fit: Fit[FittedModel]) -> float:
         return robust_cost(np.concatenate(fit.residuals), scale)
 
     fits.sort(key=cost)
@@ -299,13 +304,13 @@ def fit_from_starts(
 
 
 def optimize(
-    model: Model,
+    model: FittedModel,
     segments: Sequence[Segment],
     start: np.ndarray,
     max_evaluations: int = 40,
     scale: float | None = None,
     states: Sequence[np.ndarray] | None = None,
-) -> Fit:
+) -> Fit[FittedModel]:
     """Fit the free parameters of a model to segments.
 
     Args:
@@ -356,14 +361,16 @@ def optimize(
     return Fit(model, segments, values, problem.scale, residuals, tuple(jacobians), states)
 
 
-def refit_model(fit: Fit, model: Model) -> Fit:
+def refit_model(fit: Fit[FittedModel], model: FittedModel) -> Fit[FittedModel]:
     """Fit another model to the logs of a fit, starting from the parameters of that fit."""
     segments = model.segments(fit.logs)
     refit = optimize(model.initial_guess(segments)[0], segments, fit.values)
     return dataclasses.replace(refit, logs=fit.logs, delay=fit.delay, start_fits=fit.start_fits)
 
 
-def fit_model(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None) -> Fit:
+def fit_model(
+    model: FittedModel, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None
+) -> Fit[FittedModel]:
     """Fit a model to logs from several starts, and then the delay of its input.
 
     For a winding, a delay longer and one shorter by half a row are tried, too. If both fit clearly
@@ -424,7 +431,7 @@ def _is_better(costs: np.ndarray, reference: np.ndarray) -> bool:
     )
 
 
-def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
+def fit_warnings(fit: Fit[Model], shares: dict[str, float]) -> list[str]:
     """Return warnings about the logs or the model of a fit.
 
     Args:

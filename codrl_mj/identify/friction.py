@@ -86,7 +86,7 @@ def _left_out_errors(
     return np.array(errors)
 
 
-def load_hint(fit: Fit) -> str | None:
+def load_hint(fit: Fit[ShaftModel]) -> str | None:
     """Return advice to fit a gear efficiency if it explains the logs clearly better; else None."""
     model = fit.model
     if model.friction not in _LOADED or "gear_efficiency" in (*model.known, *model.names):

@@ -5,12 +5,12 @@ import hashlib
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
+from codrl_mj.actuators import GearMotor
 from codrl_mj.fields import check_names
-from codrl_mj.identify.estimate import Fit, fit_model, refit_model
+from codrl_mj.identify.estimate import Fit, Model, fit_model, refit_model
 from codrl_mj.identify.friction import choose_friction, load_hint
 from codrl_mj.identify.log import (
     SEGMENT_DURATION,
@@ -54,7 +54,7 @@ def identify(
     held_out: Sequence[Log] = (),
     estimated: Sequence[str] = (),
     segment: float = SEGMENT_DURATION,
-    base: Mapping[str, Any] | None = None,
+    base: Mapping[str, object] | None = None,
     on_progress: Callable[[str, int, int], None] = lambda *_: None,
     seed: int = 0,
 ) -> Identified:
@@ -101,9 +101,10 @@ def identify(
     # The winding is fitted first, because the shaft needs its torque constant or resistance. Then
     # the winding is fitted again with the speed of the fitted shaft, and the shaft with the
     # constants of that winding.
-    parts: dict[str, Fit] = {}
+    winding_fit: Fit[WindingModel] | None = None
+    shaft_fit: Fit[ShaftModel] | None = None
     if electrical:
-        parts["winding"] = fit_model(WindingModel(known=fixed), electrical, step("winding"))
+        winding_fit = fit_model(WindingModel(known=fixed), electrical, step("winding"))
     if driven_by:
         shaft = ShaftModel(
             rig=rig,
@@ -116,19 +117,19 @@ def identify(
             segment=segment,
         )
         choice = choose_friction(
-            _with_winding(shaft, parts.get("winding")), moving, friction, step("friction")
+            _with_winding(shaft, winding_fit), moving, friction, step("friction")
         )
         shaft, friction = choice.model, choice.model.friction
-        parts["shaft"] = fit_model(shaft, moving, step("shaft"))
-        if electrical and driven_by != "voltage":
-            parts["winding"] = refit_model(
-                parts["winding"], WindingModel(known=fixed, shaft=parts["shaft"])
-            )
-        shaft = _with_winding(dataclasses.replace(shaft, known=fixed), parts.get("winding"))
-        parts["shaft"] = refit_model(parts["shaft"], shaft)
+        shaft_fit = fit_model(shaft, moving, step("shaft"))
+        if winding_fit is not None and driven_by != "voltage":
+            winding_fit = refit_model(winding_fit, WindingModel(known=fixed, shaft=shaft_fit))
+        shaft = _with_winding(dataclasses.replace(shaft, known=fixed), winding_fit)
+        shaft_fit = refit_model(shaft_fit, shaft)
+    fits: dict[str, Fit[Model] | None] = {"winding": winding_fit, "shaft": shaft_fit}
+    parts = {name: part for name, part in fits.items() if part is not None}
     estimates, warnings, unexplained = assess_fits(parts, fixed, defaults, seed, step)
     warnings = [*warnings, *_contradictions(estimates, motor)]
-    if "shaft" in parts and (hint := load_hint(parts["shaft"])):
+    if shaft_fit is not None and (hint := load_hint(shaft_fit)):
         warnings.append(hint)
     volts = [log.signals[name] for log in logs for name in ("voltage", "bus") if log.has(name)]
     identified = Identified(
@@ -138,8 +139,8 @@ def identify(
         driven_by=driven_by,
         delays={name: part.delay for name, part in parts.items()},
         estimates=tuple(estimates),
-        fitted=_predict_logs(parts.get("shaft"), moving),
-        held_out=_predict_logs(parts.get("shaft"), held_out),
+        fitted=_predict_logs(shaft_fit, moving),
+        held_out=_predict_logs(shaft_fit, held_out),
         warnings=tuple(warnings),
         base=base,
         traces=tuple(trace for name, part in parts.items() for trace in fitted_traces(name, part)),
@@ -214,7 +215,7 @@ def _better_identified(with_current: Identified, with_voltage: Identified) -> Id
     )
 
 
-def _with_winding(shaft: ShaftModel, winding: Fit | None) -> ShaftModel:
+def _with_winding(shaft: ShaftModel, winding: Fit[WindingModel] | None) -> ShaftModel:
     """Return a shaft with the parameter of the fitted winding that it needs, unless it is known.
 
     A shaft that is driven by a current needs the torque constant, which equals the winding's
@@ -271,7 +272,7 @@ def _digest(log: Log) -> bytes:
     return digest.digest()
 
 
-def _contradictions(estimates: Sequence[Estimate], motor: Any) -> list[str]:
+def _contradictions(estimates: Sequence[Estimate], motor: GearMotor | None) -> list[str]:
     """Return a warning if the rotor inertia of the datasheet exceeds the total identified inertia.
 
     The datasheet's rotor inertia is used only if the logs and known values do not determine it.
@@ -296,7 +297,7 @@ def check_arguments(
     friction: str = "coulomb",
     estimated: Sequence[str] = (),
     segment: float = SEGMENT_DURATION,
-    base: Mapping[str, Any] | None = None,
+    base: Mapping[str, object] | None = None,
 ) -> dict[str, float]:
     """Validate the arguments of `identify`, and return the known parameters and gear ratio."""
     motor = base_motor(base)
@@ -357,7 +358,7 @@ def check_arguments(
 
 
 def predict_missing(
-    logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, Any] | None
+    logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, object] | None
 ) -> str | None:
     """Return a message on actuator parameters that these logs cannot determine, or None.
 
@@ -375,7 +376,7 @@ def predict_missing(
     return missing_parameters(names, base)
 
 
-def _predict_logs(shaft: Fit | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
+def _predict_logs(shaft: Fit[ShaftModel] | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
     """Predict the moving logs that have the input and the output of a fitted shaft."""
     if shaft is None:
         return ()

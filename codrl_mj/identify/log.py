@@ -427,7 +427,8 @@ def smoothed_speeds(
     ]
     t, q, tq, tt = (values[last] - values[first] for values in cumulative)
     num_rows = last - first
-    return (num_rows * tq - t * q) / (num_rows * tt - t * t)
+    slopes: np.ndarray = (num_rows * tq - t * q) / (num_rows * tt - t * t)
+    return slopes
 
 
 def cut_segments(log: Log, duration: float) -> list[slice]:

@@ -4,11 +4,11 @@ import dataclasses
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Model, Simulate, best_initial_state
+from codrl_mj.identify.estimate import Fit, Model, Simulate, best_initial_state
 from codrl_mj.identify.log import (
     BLOCK_DURATION,
     SEGMENT_DURATION,
@@ -30,6 +30,8 @@ from codrl_mj.identify.parameters import (
     FRICTION_PARAMETERS,
     PARAMETERS,
     RIG_PARAMETERS,
+    ShaftParameters,
+    shaft_parameters,
 )
 
 
@@ -39,8 +41,8 @@ class WindingModel(Model):
 
     driven_by: str = "voltage"
     output: str = "current"
-    shaft: Any = None
-    """`Fit` of a shaft driven by the current, to compute the speed between rows; None: not used."""
+    shaft: "Fit[ShaftModel] | None" = None
+    """Shaft driven by the current, to compute the speed between rows; None: not used."""
 
     steps: ClassVar = np.array([1e-3])
 
@@ -184,10 +186,8 @@ class ShaftModel(Model):
 
     steps: ClassVar = np.array([1e-4, 1e-3])
 
-    def shaft_parameters(self, values: np.ndarray) -> Any:
-        """Return the `ShaftParameters` for a simulation, from free parameters of shape (p,)."""
-        from codrl_mj.identify.simulation import shaft_parameters
-
+    def shaft_parameters(self, values: np.ndarray) -> ShaftParameters:
+        """Return the parameters for a simulation, from free parameters of shape (p,)."""
         parameters = self.all_values(values)
         ratio = parameters["gear_ratio"]
         gain, braking = parameters["torque_gain"], 0.0

@@ -3,6 +3,7 @@
 Parameters of a motor have the names of `GearMotor`'s fields, and are values at the rotor.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 
@@ -121,3 +122,51 @@ ESTIMABLE = {
     "resistance": "voltage",
 }
 """Optional free parameter of a shaft -> the input that it requires; None: any input."""
+
+
+class WindingParameters(NamedTuple):
+    """Resistance, inductance and back-EMF constant of a winding."""
+
+    resistance: float  # [ohm]
+    inductance: float  # [H]
+    back_emf_constant: float  # [V*s/rad], at the motor's output
+
+
+class ShaftParameters(NamedTuple):
+    """Inertia, load and friction of a shaft, at the motor's output."""
+
+    inertia: float  # [kg*m^2], > 0
+    gravity: float  # m*g*l [N*m]; the torque of gravity is -m*g*l*sin(position)
+    constant_torque: float  # constant load torque [N*m], positive if it opposes positive speeds
+    coulomb: float  # [N*m]
+    viscous: float  # [N*m*s/rad]
+    gear_efficiency: float  # in (0, 1]
+    stribeck_friction: float  # [N*m]
+    stribeck_speed: float  # [rad/s]
+    stribeck_exponent: float  # `GearMotor.stribeck_exponent`
+    # `shaft.friction` reads this field, but ignores it when it is called with an inertia.
+    rotor_inertia: float
+    gain: float  # torque over the input [N*m per unit]
+    # Loss of torque per speed [N*m*s/rad]: kT*kE/R if the input is a voltage, else 0.
+    braking: float
+
+
+def shaft_parameters(
+    parameters: Mapping[str, float], gain: float, braking: float = 0.0
+) -> ShaftParameters:
+    """Convert parameters, named as in `PARAMETERS`, from values at the rotor to the output."""
+    ratio = parameters["gear_ratio"]
+    return ShaftParameters(
+        parameters["inertia"],
+        parameters["mgl"],
+        parameters["constant_torque"],
+        parameters["coulomb_friction"] * ratio,
+        parameters["viscous_friction"] * ratio**2,
+        parameters["gear_efficiency"],
+        parameters["stribeck_friction"] * ratio,
+        parameters["stribeck_speed"] / ratio,
+        parameters.get("stribeck_exponent", 2.0),
+        0.0,
+        gain,
+        braking,
+    )

@@ -320,7 +320,8 @@ def _finite_values(name: str, table: Table) -> np.ndarray:
         values = table.numeric_column(name)
     except ValueError:
         return np.empty(0)
-    return values[np.isfinite(values)]
+    finite: np.ndarray = values[np.isfinite(values)]
+    return finite
 
 
 def _infer_unit(

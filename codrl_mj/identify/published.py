@@ -2,7 +2,7 @@
 
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 from codrl_mj.fields import did_you_mean
 from codrl_mj.user_code import asset_path
@@ -10,11 +10,31 @@ from codrl_mj.user_code import asset_path
 DATA_SUBFOLDER = "bench_logs"  # subfolder that holds the downloaded data sets
 
 
-def published_datasets() -> dict[str, dict[str, Any]]:
-    """Return the data sets by name.
+class PublishedFile(TypedDict):
+    """A file of a data set."""
 
-    Each has `title`, `source`, `commit`, `licence`, `columns` for `read_log`, and `files`.
-    """
+    path: str
+    """Path in the repository."""
+    sha256: str
+    """Digest of the content."""
+
+
+class PublishedDataset(TypedDict):
+    """A data set in a repository of its authors."""
+
+    title: str
+    source: str
+    """Address of the repository."""
+    commit: str
+    licence: str
+    columns: str
+    """Mapping of the files' columns, for `read_log`."""
+    files: dict[str, PublishedFile]
+    """Name of a downloaded file -> its origin."""
+
+
+def published_datasets() -> dict[str, PublishedDataset]:
+    """Return the data sets by name."""
     return tomllib.loads(asset_path("published.toml").read_text(encoding="utf-8"))
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.columns import Column, parse_columns
+from codrl_mj.identify.columns import Column, Operand, parse_columns
 from codrl_mj.identify.log import SIGNALS, Finding, Log, find_resolution
 
 _WORDS = {
@@ -35,10 +35,17 @@ _SIGN_BITS = {
 _MAX_UNUSABLE = 0.2  # share of rows that may be unreadable or out of order
 
 
+# JSON and Parquet have values of any type, which the readers check one by one.
+Content = Any
+"""Parsed content of a file."""
+Cell = object
+"""Cell of a table: a text, a number, None, or a list of them."""
+
+
 class Table(NamedTuple):
     """The contents of a file."""
 
-    columns: Mapping[str, Any]  # texts or numbers, all of the same length
+    columns: Mapping[str, Sequence[Cell]]  # texts or numbers, all of the same length
     constants: Mapping[str, float]
     ragged: list[int]  # numbers of incomplete rows, from 1
     lines: Sequence[int] = ()  # line of the file for each row
@@ -194,7 +201,7 @@ def table_to_log(name: str, table: Table, mapping: Mapping[str, Column]) -> Log:
 
 
 def _find_unsigned(
-    values: Mapping[str, Any], mapping: Mapping[str, Column], row_numbers: np.ndarray
+    values: Mapping[str, Operand | None], mapping: Mapping[str, Column], row_numbers: np.ndarray
 ) -> Iterator[Finding]:
     """Find columns that look like signed registers read as unsigned numbers."""
     unconverted = (
@@ -270,7 +277,7 @@ def read_table(path: Path) -> Table:
     See `read_log` for the formats.
     """
     table = _read_table(path)
-    columns: dict[str, Any] = {}
+    columns: dict[str, Sequence[Cell]] = {}
     for name, values in table.columns.items():
         lists = (
             [_as_list(value) for value in values]
@@ -294,10 +301,10 @@ def read_table(path: Path) -> Table:
     return table._replace(columns=columns)
 
 
-def _as_list(value: Any) -> list[Any] | None:
+def _as_list(value: Cell) -> Sequence[Cell] | None:
     """Return a cell's list, also from a text such as `[0.1 2]`; None if it holds none."""
-    if isinstance(value, str) and value[:1] == "[" and value[-1:] == "]":
-        return value.strip("[]").replace(",", " ").split()
+    if isinstance(value, str):
+        return _split_list(value)
     return (
         value
         if isinstance(value, list) and not any(isinstance(entry, list | dict) for entry in value)
@@ -305,7 +312,14 @@ def _as_list(value: Any) -> list[Any] | None:
     )
 
 
-def _entry_names(content: Any) -> dict[str, list[str]]:
+def _split_list(text: str) -> list[str] | None:
+    """Return the entries of a text such as `[0.1 2]`; None for other texts."""
+    return (
+        text.strip("[]").replace(",", " ").split() if text[:1] == "[" and text[-1:] == "]" else None
+    )
+
+
+def _entry_names(content: Content) -> dict[str, list[str]]:
     """Return the entries' names of list columns, from `features` in a parsed file."""
     features = content.get("features") if isinstance(content, dict) else None
     entries = {}
@@ -418,7 +432,7 @@ def _is_filled(row: Sequence[str]) -> bool:
     num_missing, num_numbers = sum(cell.lower() in ("", "null", "none", "na") for cell in row), 0
     for cell in row:
         try:
-            for number in _as_list(cell) or [cell.replace(",", ".")]:
+            for number in _split_list(cell) or [cell.replace(",", ".")]:
                 float(number)
             num_numbers += 1
         except ValueError:
@@ -426,7 +440,7 @@ def _is_filled(row: Sequence[str]) -> bool:
     return num_missing == len(row) or 2 * num_numbers > len(row) - num_missing
 
 
-def _json(content: Any) -> Table:
+def _json(content: Content) -> Table:
     """Convert parsed JSON, which is a list of rows or an object."""
     fields = content if isinstance(content, dict) else {"": content}
     constants = {

@@ -4,13 +4,14 @@ import dataclasses
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 
-from codrl_mj.actuators import Drive, Supply, actuator_from_mapping
-from codrl_mj.identify.estimate import Fit, best_initial_state
+from codrl_mj.actuators import Drive, GearMotor, Supply, actuator_from_mapping
+from codrl_mj.identify.estimate import Fit, Model, best_initial_state
 from codrl_mj.identify.log import Log, Segment, gapless_stretches, initial_state
+from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.parameters import DEFAULTS, MOTOR_PARAMETERS, PARAMETERS
 from codrl_mj.runs.files import atomic_write, write_json
 
@@ -26,13 +27,13 @@ START_DURATION = 0.03
 """Duration [s] at the start of a prediction to which the initial state is fitted; >= 5 rows."""
 
 
-def base_motor(base: Mapping[str, Any] | None) -> Any:
-    """Return the `GearMotor` of a drive's mapping; None if it has none."""
+def base_motor(base: Mapping[str, object] | None) -> GearMotor | None:
+    """Return the motor of a drive's mapping; None if it has none."""
     drive = None if base is None else actuator_from_mapping(base)
     return drive.motor if isinstance(drive, Drive) else None
 
 
-def missing_parameters(names: Collection[str], base: Mapping[str, Any] | None) -> str | None:
+def missing_parameters(names: Collection[str], base: Mapping[str, object] | None) -> str | None:
     """Return a message on parameters that are neither in `names` nor in a base, or None."""
     motor = base_motor(base)
     if (
@@ -125,7 +126,7 @@ class Prediction:
     """Simulation of `open_loop`; not written to files."""
 
 
-def predict(fit: Fit, log: Log) -> Prediction:
+def predict(fit: Fit[ShaftModel], log: Log) -> Prediction:
     """Simulate a log with a fitted shaft, and return the prediction errors."""
     model, simulate, errors, simulated = fit.model, fit.model.simulator(fit.values), [], []
     segments = dataclasses.replace(model, segment=HORIZON).segments([log])
@@ -141,7 +142,7 @@ def predict(fit: Fit, log: Log) -> Prediction:
     return Prediction(log.name, model.output, error, closed_loop_error(fit, log), trace)
 
 
-def closed_loop_error(fit: Fit, log: Log) -> float | None:
+def closed_loop_error(fit: Fit[ShaftModel], log: Log) -> float | None:
     """Return the mean absolute error [rad] over a whole log under its command.
 
     The servo is modeled as a proportional controller. Its gain is fitted to those rows in which the
@@ -185,7 +186,7 @@ def closed_loop_error(fit: Fit, log: Log) -> float | None:
     return mean_error if math.isfinite(mean_error) else None
 
 
-def fitted_traces(part: str, fit: Fit) -> Iterator[Trace]:
+def fitted_traces(part: str, fit: Fit[Model]) -> Iterator[Trace]:
     """Yield the trace of a fitted `winding` or `shaft` for each of its logs."""
     for index, log in enumerate(fit.logs):
         pairs = zip(fit.segments, fit.residuals, strict=True)
@@ -218,7 +219,7 @@ class Identified:
     held_out: tuple[Prediction, ...]
     """Errors on the logs held out."""
     warnings: tuple[str, ...]
-    base: Mapping[str, Any] | None = None
+    base: Mapping[str, object] | None = None
     """Mapping of a drive that supplies the parameters that the logs do not determine, or None."""
     traces: tuple[Trace, ...] = ()
     """Traces of winding and shaft for the fitted logs; not written to files."""
@@ -315,7 +316,7 @@ class Identified:
             and estimate.low < estimate.high
         }
 
-    def actuator(self) -> Any:
+    def actuator(self) -> Drive:
         """Return the drive with the identified and the known parameters.
 
         Raises:
@@ -326,7 +327,7 @@ class Identified:
             raise ValueError(problem)
         supply = None if self.supply is None else Supply(self.supply)
         base = Drive(supply=supply) if self.base is None else actuator_from_mapping(self.base)
-        return base.replaced(
+        return cast(Drive, base).replaced(
             {
                 f"motor.{estimate.name}": estimate.value
                 for estimate in self.estimates
@@ -334,7 +335,7 @@ class Identified:
             }
         )
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> dict[str, object]:
         """Return all results as values that JSON can store."""
         values = dataclasses.asdict(self) | {"problem": self.problem()}
         values |= {"supply_text": self.supply_text, "base_text": self.base_text}
@@ -362,7 +363,7 @@ class Identified:
             actuator.unlink(missing_ok=True)
             return [result]
         intervals = {name: list(ends) for name, ends in self.intervals().items()}
-        section: dict[str, Any] = {"logs": list(self.logs), "intervals": intervals}
+        section: dict[str, object] = {"logs": list(self.logs), "intervals": intervals}
         content = {**self.actuator().as_mapping(), "identified": section}
         with atomic_write(actuator) as temporary:
             temporary.write_text(yaml.safe_dump(content, sort_keys=False))

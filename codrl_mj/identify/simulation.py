@@ -6,57 +6,17 @@ Fitted parameters therefore have the same meaning in a simulation with MuJoCo.
 """
 
 import math
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable
 
 import numba
 import numpy as np
 
 from codrl_mj.actuators import shaft
 from codrl_mj.compile_cache import njit
+from codrl_mj.identify.parameters import ShaftParameters, WindingParameters
 
 MAX_SUBSTEP = 1e-3
 """Longest substep [s]; longer intervals between rows are divided."""
-
-
-class ShaftParameters(NamedTuple):
-    """Inertia, load and friction of a shaft, at the motor's output."""
-
-    inertia: float  # [kg*m^2], > 0
-    gravity: float  # m*g*l [N*m]; the torque of gravity is -m*g*l*sin(position)
-    constant_torque: float  # constant load torque [N*m], positive if it opposes positive speeds
-    coulomb: float  # [N*m]
-    viscous: float  # [N*m*s/rad]
-    gear_efficiency: float  # in (0, 1]
-    stribeck_friction: float  # [N*m]
-    stribeck_speed: float  # [rad/s]
-    stribeck_exponent: float  # `GearMotor.stribeck_exponent`
-    # `shaft.friction` reads this field, but ignores it when it is called with an inertia.
-    rotor_inertia: float
-    gain: float  # torque over the input [N*m per unit]
-    # Loss of torque per speed [N*m*s/rad]: kT*kE/R if the input is a voltage, else 0.
-    braking: float
-
-
-def shaft_parameters(
-    parameters: Mapping[str, float], gain: float, braking: float = 0.0
-) -> ShaftParameters:
-    """Convert parameters, named as in `PARAMETERS`, from values at the rotor to the output."""
-    ratio = parameters["gear_ratio"]
-    return ShaftParameters(
-        parameters["inertia"],
-        parameters["mgl"],
-        parameters["constant_torque"],
-        parameters["coulomb_friction"] * ratio,
-        parameters["viscous_friction"] * ratio**2,
-        parameters["gear_efficiency"],
-        parameters["stribeck_friction"] * ratio,
-        parameters["stribeck_speed"] / ratio,
-        parameters.get("stribeck_exponent", 2.0),
-        0.0,
-        gain,
-        braking,
-    )
 
 
 @njit(nogil=True, error_model="numpy")
@@ -85,13 +45,20 @@ def simulate_winding(
 
 
 # Compiled code can call the friction function only through a global of this module.
-_friction: Any = numba.njit(shaft.friction)
-_Shaft: Any = shaft.Shaft
+_friction: Callable[[ShaftParameters, float, float, shaft.Shaft], float] = numba.njit(
+    shaft.friction
+)
+_Shaft = shaft.Shaft
 
 
 @njit(nogil=True, error_model="numpy")
 def step_shaft(
-    duration: float, drive: float, slope: float, position: float, speed: float, parameters: Any
+    duration: float,
+    drive: float,
+    slope: float,
+    position: float,
+    speed: float,
+    parameters: ShaftParameters,
 ) -> tuple[float, float]:
     """Return position [rad] and speed [rad/s] after a duration [s].
 
@@ -142,7 +109,7 @@ def simulate_shaft(
     slopes: np.ndarray,
     position: float,
     speed: float,
-    parameters: Any,
+    parameters: ShaftParameters,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return positions and speeds at the times, each of shape (n,).
 
@@ -166,7 +133,7 @@ def simulate_servo(
     gain: float,
     position: float,
     speed: float,
-    parameters: Any,
+    parameters: ShaftParameters,
 ) -> np.ndarray:
     """Return the positions of a servo at the times, shape (n,).
 
@@ -189,7 +156,7 @@ def simulate_samples(
     duties: np.ndarray,
     supply_voltage: float,
     supply_resistance: float,
-    parts: Any,
+    parts: tuple[WindingParameters, ShaftParameters],
     locked: bool,
     position: float,
 ) -> np.ndarray:
@@ -203,7 +170,7 @@ def simulate_samples(
         duties: duty of the bridge at each sample, in [-1, 1].
         supply_voltage: voltage of the supply without load [V].
         supply_resistance: internal resistance of the supply [ohm].
-        parts: tuple of (R, L, kE at the output) and `ShaftParameters`.
+        parts: parameters of the winding and of the shaft.
         locked: True if the shaft is held.
         position: initial position [rad].
 

@@ -18,6 +18,7 @@ from codrl_mj.actuators.shaft import resistance_at
 from codrl_mj.fields import Checked, check_memory, check_names, real
 from codrl_mj.identify.columns import COLUMN_UNITS
 from codrl_mj.identify.log import Log
+from codrl_mj.identify.parameters import WindingParameters, shaft_parameters
 from codrl_mj.runs.files import atomic_write
 
 
@@ -58,7 +59,8 @@ class Excitation(Checked):
 
 def _slow_sine(excitation: Excitation, time: np.ndarray) -> np.ndarray:
     """Return a sine of amplitude 1."""
-    return np.sin(2.0 * math.pi * excitation.frequency * time)
+    sine: np.ndarray = np.sin(2.0 * math.pi * excitation.frequency * time)
+    return sine
 
 
 def _prbs(excitation: Excitation, time: np.ndarray) -> np.ndarray:
@@ -66,7 +68,8 @@ def _prbs(excitation: Excitation, time: np.ndarray) -> np.ndarray:
     from scipy.signal import max_len_seq
 
     bits = 2.0 * max_len_seq(13)[0].astype(float) - 1.0
-    return bits[np.floor(time / excitation.clock + 1e-9).astype(int) % len(bits)]
+    values: np.ndarray = bits[np.floor(time / excitation.clock + 1e-9).astype(int) % len(bits)]
+    return values
 
 
 EXCITATIONS: dict[str, Callable[[Excitation, np.ndarray], np.ndarray]] = {
@@ -178,7 +181,7 @@ def simulate_drive(
     Returns:
         A log with a row per sample; its `command` is the requested voltage [V].
     """
-    from codrl_mj.identify.simulation import shaft_parameters, simulate_samples
+    from codrl_mj.identify.simulation import simulate_samples
 
     period, limit, motor = 1.0 / drive.controller.sample_rate, drive.voltage_limit, drive.motor
     locked = load.locked
@@ -190,7 +193,9 @@ def simulate_drive(
         np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
     )
     resistance = resistance_at(motor, motor.ambient_temperature)
-    winding = resistance, motor.inductance, motor.back_emf_constant * motor.gear_ratio
+    winding = WindingParameters(
+        resistance, motor.inductance, motor.back_emf_constant * motor.gear_ratio
+    )
     inertia = motor.rotor_inertia * motor.gear_ratio**2 + load.inertia
     if not inertia > 0.0 and not locked:
         raise ValueError(

@@ -10,11 +10,10 @@ identified are reported.
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit, fit_warnings, optimize
+from codrl_mj.identify.estimate import Fit, Model, fit_warnings, optimize
 from codrl_mj.identify.log import BLOCK_DURATION, Log, halve_rate, has_motion, replace_signal
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import DEFAULTS, FRICTION, PARAMETERS, WINDING_SOURCES
@@ -71,11 +70,11 @@ BOUND_MARGIN = 1e-3
 
 
 def assess_fits(
-    parts: Mapping[str, Fit],
+    parts: Mapping[str, Fit[Model]],
     known: Mapping[str, float],
     defaults: Mapping[str, float],
     seed: int,
-    step: Callable[[str], Any],
+    step: Callable[[str], Callable[[], None]],
 ) -> tuple[list[Estimate], list[str], float]:
     """Assess the fits of a winding and a shaft.
 
@@ -116,7 +115,7 @@ def assess_fits(
     return completed, warnings, unexplained
 
 
-def _assess_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estimate]:
+def _assess_part(fit: Fit[Model], seed: int, on_step: Callable[[], None]) -> list[Estimate]:
     """Return a part's free parameters and its total friction, with intervals and status."""
     model, names = fit.model, fit.model.names
     if not names:
@@ -331,7 +330,7 @@ def _update_status(estimates: list[Estimate]) -> list[Estimate]:
     return updated
 
 
-def _total_friction(fit: Fit) -> tuple[float, dict[str, float], dict[str, float]]:
+def _total_friction(fit: Fit[Model]) -> tuple[float, dict[str, float], dict[str, float]]:
     """Return the total friction of a shaft at the RMS of its speeds and torques.
 
     Returns:
@@ -416,7 +415,7 @@ def _complete(
     return [by_name[name] for name in PARAMETERS if name in by_name]
 
 
-def _gauss_newton_sums(fit: Fit, groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_newton_sums(fit: Fit[Model], groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return gradient (c, p) and Gauss-Newton matrix (c, p, p) of each group of segments."""
     count, size = len(set(groups)), len(fit.values)
     gradients, matrices = np.zeros((count, size)), np.zeros((count, size, size))
@@ -428,7 +427,7 @@ def _gauss_newton_sums(fit: Fit, groups: Sequence[int]) -> tuple[np.ndarray, np.
     return gradients, matrices
 
 
-def _noise(fit: Fit) -> float:
+def _noise(fit: Fit[Model]) -> float:
     """Return the weighted mean square of the residuals."""
     return float(
         np.mean(np.concatenate([fit.weights(i) * r**2 for i, r in enumerate(fit.residuals)]))
@@ -449,7 +448,7 @@ def _inverse(matrix: np.ndarray, scales: np.ndarray) -> np.ndarray:
 
 
 def interval_causes(
-    fit: Fit,
+    fit: Fit[Model],
     values: np.ndarray,
     scales: np.ndarray,
     matrix: np.ndarray,
@@ -504,7 +503,7 @@ def interval_causes(
 
 
 def resampled_half_widths(
-    fit: Fit, scales: np.ndarray, matrix: np.ndarray, seed: int
+    fit: Fit[Model], scales: np.ndarray, matrix: np.ndarray, seed: int
 ) -> dict[str, np.ndarray]:
     """Return the half-widths of 95 % intervals by three statistical causes, each of shape (q,).
 
@@ -546,7 +545,7 @@ def resampled_half_widths(
     return {"curvature": curvature, "resampling": resampling, "logs": logs}
 
 
-def correlations(fit: Fit) -> dict[str, dict[str, float]]:
+def correlations(fit: Fit[Model]) -> dict[str, dict[str, float]]:
     """Return the correlations; parameters with one near 1 or -1 can hardly be distinguished."""
     names = fit.model.names
     if not names:
@@ -560,7 +559,7 @@ def correlations(fit: Fit) -> dict[str, dict[str, float]]:
     }
 
 
-def unidentifiable_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, float]]:
+def unidentifiable_directions(fit: Fit[Model], scales: np.ndarray) -> list[dict[str, float]]:
     """Return the directions in which the parameters can change without a worse fit.
 
     The derivatives give the weakest direction. Its largest parameter is changed by half its scale,
@@ -619,7 +618,7 @@ def unidentifiable_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, fl
     return directions
 
 
-def _significant_increase(fit: Fit) -> float:
+def _significant_increase(fit: Fit[Model]) -> float:
     """Return the increase of the robust cost that is significant at 95 %.
 
     Residuals within a block are correlated. To correct for this, the variance along the best
@@ -633,15 +632,15 @@ def _significant_increase(fit: Fit) -> float:
     noise = _noise(fit)
     correlation = max(float(projections @ projections) / max(strengths[-1] * noise, 1e-30), 1.0)
     # 3.84 is the 95 % quantile of the chi-squared distribution with one degree of freedom.
-    return 3.84 * noise * correlation + SLACK * fit.cost
+    return float(3.84 * noise * correlation + SLACK * fit.cost)
 
 
-def _refit_values(fit: Fit, logs: Sequence[Log]) -> np.ndarray:
+def _refit_values(fit: Fit[Model], logs: Sequence[Log]) -> np.ndarray:
     """Return the parameters from a fit of the same model to other logs."""
     return optimize(fit.model, fit.model.segments(logs), fit.values, 20).values
 
 
-def _simulated_logs(fit: Fit, sign: float) -> list[Log]:
+def _simulated_logs(fit: Fit[Model], sign: float) -> list[Log]:
     """Simulate the logs of a fit with its residuals as noise, at the resolution of their sensors.
 
     The residuals of each segment are added in their order, which preserves their correlation, but

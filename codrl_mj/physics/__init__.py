@@ -7,6 +7,7 @@ Batches store many simulations as rows of arrays, which several threads step: `r
 
 from collections.abc import Callable
 
+from codrl_mj.engine.reading import motors
 from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.base import (
     PHYSICS,
@@ -17,7 +18,7 @@ from codrl_mj.physics.base import (
     signal_names,
     trace_names,
 )
-from codrl_mj.physics.mjcf import hills, install_callbacks, motors, needed_callbacks
+from codrl_mj.physics.mjcf import hills, install_callbacks, needed_callbacks
 from codrl_mj.physics.mujoco_single import MujocoPhysics
 
 PHYSICS.update(mujoco=MujocoPhysics, analytic=AnalyticPhysics)

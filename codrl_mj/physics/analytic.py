@@ -1,12 +1,12 @@
 """Simulation of a task by its reference: unmodified Gymnasium, or equations in closed form."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Inputs, parameters_type
-from codrl_mj.physics.base import Physics, SimulationConfig
+from codrl_mj.actuators.parameters import Parameters
+from codrl_mj.physics.base import Force, Physics, SimulationConfig
 
 
 class AnalyticPhysics(Physics):
@@ -38,14 +38,15 @@ class AnalyticPhysics(Physics):
         super().__init__(simulation)
         self.timestep = simulation.timestep
         self.reference_env = task.reference_env()
-        self._actuators: list[tuple[float, Any]] = []
+        self._actuators: list[tuple[float, Parameters]] = []
         self.set_actuators(simulation.actuators)
         self.reset(np.zeros(len(task.state_names)))
 
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
         """Start an episode; see `Physics.reset`."""
         self.state = np.array(state, dtype=np.float64)
-        rest = self.simulation.family.State(*[0.0] * len(self.simulation.family.State._fields))  # type: ignore[attr-defined]
+        kind = self.simulation.family.State
+        rest = kind._make([0.0] * len(kind._fields))
         self._states = [rest] * len(self._actuators)
         self.time = 0.0
         self._key = key
@@ -60,7 +61,7 @@ class AnalyticPhysics(Physics):
             (actuator.arm_radius, kind(*actuator.parameter_values)) for actuator in actuators
         ]
 
-    def step(self, desired_force: Any) -> None:
+    def step(self, desired_force: Force) -> None:
         """Take an environment step; see `Physics.step`."""
         desired = np.atleast_2d(np.asarray(desired_force, dtype=np.float64))
         has_several, speeds = len(self._actuators) > 1, list(self.simulation.task.speed_indices)
@@ -68,7 +69,7 @@ class AnalyticPhysics(Physics):
             commands, loads = (array[0] for array in self._disturber.disturb_commands(desired))
             for motor_index, (row, command) in enumerate(zip(rows, commands.tolist(), strict=True)):
                 row[:-1] = command, *self._advance(motor_index, command)
-            force: Any = rows[:, 1] if has_several else float(rows[0, 1])
+            force: Force = rows[:, 1] if has_several else float(rows[0, 1])
             if self._disturber.enabled:
                 force = force + (loads if has_several else float(loads[0]))
             self.state = self.reference_env(
@@ -126,8 +127,8 @@ class AnalyticPhysics(Physics):
         size, kind = len(self.simulation.task.state_names), self.simulation.family.State
         self.state = snapshot[:size].copy()
         *values, self.time, self._key = snapshot[size:].tolist()
-        count = len(kind._fields)  # type: ignore[attr-defined]
+        count = len(kind._fields)
         self._states = [
-            kind(*values[index * count : (index + 1) * count])
+            kind._make(values[index * count : (index + 1) * count])
             for index in range(len(self._actuators))
         ]

@@ -4,16 +4,18 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Family, Ideal, check_same_family
+from codrl_mj.boundary import Info
 from codrl_mj.disturbances import NO_DISTURBANCES, UNMODIFIED_JOINT, Disturbances, Joint
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
 
-Signals = dict[str, Any]
+Signals = Info
 """Signals of the actuators after one environment step, by name: `desired_force` and `actual_force`
 [N or N*m], the family's signals at the end of the last integration step, and `saturated`. Values
 are numbers for a task with one actuator and arrays (n,) for several; a batch adds a first axis.
@@ -36,7 +38,7 @@ def signal_names(family: Family) -> tuple[str, ...]:
 
 
 @functools.cache
-def make_info_reader(names: tuple[str, ...]) -> Callable[[Any], Signals]:
+def make_info_reader(names: tuple[str, ...]) -> Callable[[Sequence[object] | np.ndarray], Signals]:
     """Return a function that turns a trace's columns, numbers or arrays, into `Signals`.
 
     The last entry is the flag `saturated`. For a family without this signal, it is False, with the
@@ -52,7 +54,41 @@ def make_info_reader(names: tuple[str, ...]) -> Callable[[Any], Signals]:
         if "saturated" in names
         else "columns[0] < columns[0]"
     )
-    return eval(f"lambda columns: {{{', '.join(entries)}, 'saturated': {flag}}}")
+    reader: Callable[[Sequence[object] | np.ndarray], Signals] = eval(
+        f"lambda columns: {{{', '.join(entries)}, 'saturated': {flag}}}"
+    )
+    return reader
+
+
+Force = float | np.ndarray
+"""Desired force [N] or torque [N*m]: a number, or an array (n,) for several actuators."""
+Scene = tuple[mujoco.MjModel, mujoco.MjData]
+"""Model and data of a simulation in MuJoCo."""
+Compiled = Callable[..., Any]
+"""Function that numba compiled; its docstring gives the arguments, which numba checks by itself."""
+NumbaTuple = Any
+"""Tuple of arrays, numbers and tuples, whose type numba infers when it compiles a function."""
+
+
+class Stepping(NamedTuple):
+    """Compiled functions of a simulation, which `codrl_mj.physics.stepping` defines.
+
+    `pointers` is the address of its `codrl_mj.physics.stepping.PointerTable`.
+    """
+
+    step: Callable[[Force, int], bool]
+    """(force, pointers) -> True if the state is valid, within `MAX_STATE`: takes one environment
+    step under a desired force [N or N*m], or an array (n,) of several. The actuators' signals are
+    in `trace`.
+    """
+    start: Callable[[np.ndarray, float, int], None]
+    """(state (n,), key, pointers) -> None, which starts an episode like `Physics.reset`."""
+    read: Callable[[np.ndarray, int], None]
+    """(state (n,), pointers) -> None, which fills `state` with the present state."""
+    read_sensors: Callable[[np.ndarray, np.ndarray, int], None]
+    """(row of trace (n, c), readings (n, k), pointers) -> None, which fills the sensors'
+    `readings`.
+    """
 
 
 MAX_STATE = 1e10
@@ -133,18 +169,20 @@ class Physics(abc.ABC):
     raise for everything that it cannot simulate.
     """
 
-    stepping: Any = None
+    stepping: Stepping | None = None
     """Compiled functions (see `codrl_mj.physics.stepping.Stepping`); None if a step is Python code.
     """
     pointers: int = 0
     """Address of the `PointerTable`, the last argument of the compiled functions; 0 if there are
     none.
     """
-    bound_arrays: tuple[Any, ...] = ()
+    pointer_table: np.ndarray
+    """The table itself, int64; only with compiled functions."""
+    bound_arrays: tuple[np.ndarray, ...] = ()
     """Arrays of the environment's options and observation that its compiled steps read and fill;
     empty until they are needed.
     """
-    scene: tuple[Any, Any] | None = None
+    scene: Scene | None = None
     """`mujoco.MjModel` and `mujoco.MjData` of the simulation; None without MuJoCo."""
 
     state: np.ndarray
@@ -230,7 +268,7 @@ class Physics(abc.ABC):
         return self._disturber.memory.reshape(-1)
 
     @abc.abstractmethod
-    def step(self, desired_force: Any) -> None:
+    def step(self, desired_force: Force) -> None:
         """Advance by one environment step at a constant desired force of at most `max_forces`.
 
         Args:
@@ -267,7 +305,7 @@ class Physics(abc.ABC):
         del state
 
 
-PHYSICS: dict[str, Callable[[SimulationConfig], Any]] = {}
+PHYSICS: dict[str, Callable[[SimulationConfig], Physics]] = {}
 """Available physics by name: functions from a `SimulationConfig` to a simulation."""
 
 

@@ -5,8 +5,7 @@ two libraries may differ in the last bit. `qpos` and `qvel` may be pointers or a
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import types
@@ -15,10 +14,8 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from codrl_mj.compile_cache import njit
 from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import entries_type, internal, named_tuple_type, read_row, to_floats
-from codrl_mj.physics.base import MAX_STATE
+from codrl_mj.physics.base import MAX_STATE, Compiled, Force, NumbaTuple
 from codrl_mj.tasks import Task
-
-Compiled = Callable[..., Any]
 
 
 @functools.cache
@@ -26,7 +23,7 @@ def compiled_reader(positions: tuple[int, ...], velocities: tuple[int, ...]) -> 
     """Return a function (qpos, qvel, state (n,)) -> None that fills `state` in the task's order."""
 
     @internal
-    def read(qpos: Any, qvel: Any, state: np.ndarray) -> None:
+    def read(qpos: NumbaTuple, qvel: NumbaTuple, state: np.ndarray) -> None:
         for entry in range(len(positions)):
             state[positions[entry]] = qpos[entry]
         for entry in range(len(velocities)):
@@ -56,7 +53,9 @@ def compiled_constrain(
     )
 
     @njit(nogil=True, error_model="numpy")
-    def apply_bounds(qpos: Any, qvel: Any, state: np.ndarray, timestep: float) -> None:
+    def apply_bounds(
+        qpos: NumbaTuple, qvel: NumbaTuple, state: np.ndarray, timestep: float
+    ) -> None:
         fill(qpos, qvel, state)
         if not is_finite_state(state):
             state[:] = np.nan
@@ -102,10 +101,10 @@ def compiled_outcomes(task: Task) -> Outcomes:
 
 @functools.cache
 def _compiled(
-    observation: Callable[..., Any],
-    reward: Callable[..., Any],
-    terminated: Callable[..., Any],
-    options_type: Any,
+    observation: Compiled,
+    reward: Compiled,
+    terminated: Compiled,
+    options_type: type[NamedTuple],
     size: int,
     names: tuple[str, ...],
     has_several_motors: bool,
@@ -130,7 +129,7 @@ def _compiled(
 
     @compiled
     def reward_after(
-        before: np.ndarray, force: Any, after: np.ndarray, options: np.ndarray
+        before: np.ndarray, force: Force, after: np.ndarray, options: np.ndarray
     ) -> float:
         option_tuple = options_type(*to_fixed_tuple(options, options_count))
         return float(

@@ -1,6 +1,6 @@
 """Disturbances of commands and loads, compiled for one simulation and for many."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
@@ -102,7 +102,9 @@ class Disturber:
         length = whole_steps + 1 + (fraction > 0.0) + _AFTER_HISTORY if self.enabled else 0
         self.memory = np.zeros((simulations * len(rows), length))
 
-    def reset(self, rows: np.ndarray, keys: Any, initial_commands: Any = 0.0) -> None:
+    def reset(
+        self, rows: np.ndarray, keys: np.ndarray | float, initial_commands: np.ndarray | float = 0.0
+    ) -> None:
         """Start episodes of the m simulations `rows`, with random keys (m,).
 
         Until the first delayed command arrives, `initial_commands` (m, n) [N or N*m] apply.

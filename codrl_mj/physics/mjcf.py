@@ -6,6 +6,7 @@ from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel, Ideal, JointAdditions
 from codrl_mj.engine import HILL_NAMES
 from codrl_mj.engine.families import SIGNATURE, slot_size, user_header
+from codrl_mj.engine.mounting import is_in_callback
 from codrl_mj.engine.reading import motors
 from codrl_mj.physics.base import SimulationConfig
 from codrl_mj.tasks.base import INTEGRATORS
@@ -65,8 +66,7 @@ def needed_callbacks(model: mujoco.MjModel) -> tuple[str, ...]:
         ValueError: the user data of an actuator or joint has this package's signature, but not its
             layout.
     """
-    # Actuators of the plugin backend need no callback.
-    callback_motors = [index for index in motors(model) if model.actuator_plugin[index] < 0]
+    callback_motors = [index for index in motors(model) if is_in_callback(model, index)]
     return tuple(
         group for group, needed in (("motor", callback_motors), ("hill", hills(model))) if needed
     )

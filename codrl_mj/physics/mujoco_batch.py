@@ -2,14 +2,20 @@
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel
+from codrl_mj.boundary import PickledState
 from codrl_mj.engine.families import USER_HEADER_SIZE
-from codrl_mj.physics.base import MAX_STATE, SimulationConfig, SimulationDivergedError
+from codrl_mj.physics.base import (
+    MAX_STATE,
+    Compiled,
+    NumbaTuple,
+    SimulationConfig,
+    SimulationDivergedError,
+)
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.physics.mjcf import flags_with_friction
 from codrl_mj.physics.mujoco_single import MujocoPhysics
@@ -88,7 +94,7 @@ class MujocoBatchPhysics:
         self._data = [mujoco.MjData(copy.copy(self._nominal.model)) for _ in range(threads)]
         self.model, self.data = self._nominal.model, self._nominal.data
         self.stepping = self._nominal.stepping
-        self._lanes: list[tuple[Any, ...]] = []
+        self._lanes: list[NumbaTuple] = []
         slices = {name: state_slice(self.model, name) for name in ("time", "qpos", "qvel", "act")}
         self._time, self._qpos, self._qvel, self._act = (
             self._states[:, state_part] for state_part in slices.values()
@@ -98,13 +104,13 @@ class MujocoBatchPhysics:
             BatchRows(self._states, self._arms, memory.reshape(*self._arms.shape, memory.shape[1]))
         )
 
-    def _lane(self) -> tuple[Any, ...]:
+    def _lane(self) -> NumbaTuple:
         """Make all threads' lanes if model fields were added; return the first lane."""
         if not self._lanes:
             self._lanes = [
                 tuple(make_lane(self._nominal, data, self._fields)) for data in self._data
             ]
-            self._steps: Any = None
+            self._steps: NumbaTuple = None
         return self._lanes[0]
 
     def field(self, name: str) -> np.ndarray:
@@ -116,13 +122,13 @@ class MujocoBatchPhysics:
             self._lanes = []
         return self._fields[name]
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> PickledState:
         """Return everything except views and the simulations of threads."""
         return {
             name: value for name, value in self.__dict__.items() if name not in _REBUILT_ATTRIBUTES
         }
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: PickledState) -> None:
         """Restore the object, in this or another process."""
         self.__dict__.update(state)
         self._bind()
@@ -200,7 +206,7 @@ class MujocoBatchPhysics:
         if self._disturber.enabled:
             self._disturber.reset(rows, keys, self.simulation.holding_forces(states))
 
-    def step(self, kernel: Any, steps: Any) -> bool:
+    def step(self, kernel: Compiled, steps: NumbaTuple) -> bool:
         """Take an environment step of every simulation; return True if any diverged.
 
         `kernel` is `Kernels.step_rows`, and `steps` a `VectorStep`, of `codrl_mj.envs.compiled`.
@@ -215,7 +221,7 @@ class MujocoBatchPhysics:
             kernel, self._board, self._lanes, self.num_envs, self.simulation.inner_steps, *arguments
         )
 
-    def observe(self, kernel: Any, rows: np.ndarray, observations: np.ndarray) -> None:
+    def observe(self, kernel: Compiled, rows: np.ndarray, observations: np.ndarray) -> None:
         """Fill observations of simulations that were reset; `kernel` is `Kernels.observe_rows`."""
         kernel(rows, self._lane(), self._rows, observations)
 

@@ -1,15 +1,15 @@
 """One simulation of a task in MuJoCo, with actuators in the control callback."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
 
 from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel
+from codrl_mj.boundary import PickledState
 from codrl_mj.engine.families import USER_HEADER_SIZE
-from codrl_mj.physics.base import Physics, SimulationConfig
+from codrl_mj.physics.base import Force, Physics, Scene, SimulationConfig, Stepping
 from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
 from codrl_mj.physics.stepping import Wiring, compiled_stepping, make_pointer_table
 from codrl_mj.physics.variation import write_fields
@@ -25,6 +25,9 @@ class MujocoPhysics(Physics):
     this is exactly Gymnasium's update. If the task has bounds (`Task.constrain`), the state is
     moved back inside them after every integration step.
     """
+
+    stepping: Stepping
+    scene: Scene
 
     def __init__(self, simulation: SimulationConfig) -> None:
         """Compile the model and install the callbacks that it needs."""
@@ -64,7 +67,7 @@ class MujocoPhysics(Physics):
             self.data, self.settings, self._disturber.memory, self.trace
         )
         self.pointers = self.pointer_table.ctypes.data
-        self.scene: tuple[Any, Any] | None = (self.model, self.data)
+        self.scene = (self.model, self.data)
         self._callbacks = needed_callbacks(self.model)
         self.install()
 
@@ -73,11 +76,11 @@ class MujocoPhysics(Physics):
         if self._callbacks:
             engine.install(*self._callbacks)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> PickledState:
         """Return all attributes except views and model; a copy takes the model from its data."""
         return {name: value for name, value in self.__dict__.items() if name not in _VIEWS}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: PickledState) -> None:
         """Restore the object, in this or another process."""
         self.__dict__.update(state)
         # The copy of the data has its own copy of the model. Both must be the same object again, so
@@ -88,7 +91,8 @@ class MujocoPhysics(Physics):
     @property
     def time(self) -> float:  # type: ignore[override]
         """Time since the start of the episode [s]."""
-        return self.data.time
+        time: float = self.data.time
+        return time
 
     @property
     def state(self) -> np.ndarray:
@@ -149,7 +153,7 @@ class MujocoPhysics(Physics):
         # On a hill, the passive-force callback lifts the car to the surface.
         mujoco.mj_passive(self.model, self.data)
 
-    def step(self, desired_force: Any) -> None:
+    def step(self, desired_force: Force) -> None:
         """Take an environment step; see `Physics.step`."""
         if not self.stepping.step(desired_force, self.pointers):
             self.check_finite()

@@ -48,6 +48,7 @@ def _abandon_after_fork() -> None:
     The threads of a software renderer exist only in the parent process. A display of another EGL
     platform starts new threads; if there is no other platform, the inherited display is used.
     """
+    # MuJoCo's module, which exists only with the EGL backend.
     egl: Any = sys.modules.get("mujoco.egl")
     if egl is None:
         return
@@ -111,7 +112,7 @@ class OffscreenRenderer:
 
     def _make(self) -> mujoco.Renderer:
         """Create the renderer; its frame buffer is no larger than the image, to save clearing."""
-        egl: Any = sys.modules.get("mujoco.egl")
+        egl = sys.modules.get("mujoco.egl")
         limits, (width, height) = self._model.vis.global_, self._size
         largest = limits.offwidth, limits.offheight
         # Each backend raises its own errors, most of which are not exported.
@@ -158,7 +159,8 @@ class OffscreenRenderer:
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._pretty
         flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self._pretty
         if not self._reuses_sky:
-            return self._renderer.render()
+            image: np.ndarray = self._renderer.render()
+            return image
         scene = self._renderer.scene
         view = bytes(
             np.concatenate([np.append(camera.forward, camera.up) for camera in scene.camera])
@@ -225,7 +227,7 @@ def _make_current(renderer: mujoco.Renderer) -> bool:
 
 def _abandon(renderer: mujoco.Renderer | None) -> None:
     """Abandon a renderer whose context no longer exists or belongs to another process."""
-    egl: Any = sys.modules.get("mujoco.egl")
+    egl = sys.modules.get("mujoco.egl")
     if egl is not None and renderer is not None:
         # Without a current context, freeing the renderer's buffers cannot free those of another
         # context.
@@ -268,7 +270,7 @@ class DisplayWindow:
             raise DependencyNotInstalled(
                 "render_mode = 'human' needs pygame: pip install pygame-ce"
             ) from None
-        self._pygame: Any = pygame
+        self._pygame = pygame
         pygame.display.init()
         self._screen = pygame.display.set_mode((width, height))
         self._clock = pygame.time.Clock()

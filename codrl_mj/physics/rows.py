@@ -6,7 +6,7 @@ loads a row, steps or observes the simulation, and stores the row again.
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from codrl_mj.compile_cache import njit
 from codrl_mj.engine.layout import addresses, engine_function, field_address
 from codrl_mj.engine.memory import copy_bytes, f64, internal
+from codrl_mj.physics.base import NumbaTuple
 from codrl_mj.physics.mujoco_single import ARM_COLUMN, MujocoPhysics
 from codrl_mj.physics.sharing import cache_aligned_copy
 from codrl_mj.physics.stepping import PointerTable
@@ -132,7 +133,7 @@ _set_const = engine_function("mj_setConst")
 
 
 @njit(nogil=True, error_model="numpy")
-def derive_fields(rows: np.ndarray, lane: Any, derived: np.ndarray) -> None:
+def derive_fields(rows: np.ndarray, lane: NumbaTuple, derived: np.ndarray) -> None:
     """Let MuJoCo derive model fields of rows (m,); `derived` are their indices in `Lane.fields`."""
     lane = Lane(*lane)
     for row in rows:

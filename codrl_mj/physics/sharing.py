@@ -13,14 +13,14 @@ import os
 import threading
 from collections.abc import Sequence
 from queue import SimpleQueue
-from typing import Any
 
 import numpy as np
 from numba import types
 
+from codrl_mj.boundary import Argument
 from codrl_mj.compile_cache import external_function, njit
 from codrl_mj.engine.memory import atomic_add, atomic_load, internal
-from codrl_mj.physics.compiled_task import Compiled
+from codrl_mj.physics.base import Compiled, NumbaTuple
 
 _MIN_STEPS_PER_THREAD = 64
 """Number of integration steps per thread below which waking another thread does not pay."""
@@ -115,7 +115,9 @@ def make_shared_kernel(function: Compiled) -> Compiled:
     """
 
     @internal
-    def work(board: np.ndarray, count: int, threads: int, lane: Any, arguments: Any) -> None:
+    def work(
+        board: np.ndarray, count: int, threads: int, lane: NumbaTuple, arguments: NumbaTuple
+    ) -> None:
         first = 0
         while first < count:
             remaining = count - _read(board, CLAIMED)
@@ -128,7 +130,12 @@ def make_shared_kernel(function: Compiled) -> Compiled:
 
     @njit(nogil=True, error_model="numpy")
     def take_part(
-        leads: bool, board: np.ndarray, count: int, threads: int, lane: Any, arguments: Any
+        leads: bool,
+        board: np.ndarray,
+        count: int,
+        threads: int,
+        lane: NumbaTuple,
+        arguments: NumbaTuple,
     ) -> None:
         turn = _begin_turn(board) if leads else _join_turn(board, 0)
         while turn:
@@ -147,7 +154,7 @@ class _Worker:
     def __init__(self) -> None:
         self.board: np.ndarray | None = None
         """Board of the batch that this thread helps; None if it has stopped helping."""
-        self.tasks: SimpleQueue[Any] = SimpleQueue()
+        self.tasks: SimpleQueue[NumbaTuple] = SimpleQueue()
         self.thread = threading.Thread(target=self._work, daemon=True)
         self.thread.start()
 
@@ -180,10 +187,10 @@ def _stop_workers() -> None:
 def run_shared(
     function: Compiled,
     board: np.ndarray,
-    lanes: Sequence[Any],
+    lanes: Sequence[NumbaTuple],
     count: int,
     steps: int,
-    *arguments: Any,
+    *arguments: Argument,
 ) -> bool:
     """Run a kernel of `make_shared_kernel` on rows of `steps` integration steps each.
 

@@ -8,8 +8,9 @@ belong to the environment, see `codrl_mj.envs.compiled`.
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import mujoco
 import numba
 import numpy as np
 from numba import types
@@ -28,9 +29,8 @@ from codrl_mj.engine.families import (
 from codrl_mj.engine.layout import DATA, MODEL, addresses, engine_function
 from codrl_mj.engine.memory import f64, i64, internal, read_row, stack_floats
 from codrl_mj.engine.model_access import user_address
-from codrl_mj.physics.base import SimulationConfig
+from codrl_mj.physics.base import Compiled, Force, SimulationConfig, Stepping
 from codrl_mj.physics.compiled_task import (
-    Compiled,
     compiled_constrain,
     compiled_reader,
     is_finite_state,
@@ -84,7 +84,7 @@ class PointerTable(NamedTuple):
 
 
 def make_pointer_table(
-    data: Any, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray
+    data: mujoco.MjData, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray
 ) -> np.ndarray:
     """Return the `PointerTable` of a simulation; the caller keeps the contiguous arrays alive."""
     addresses_of_arrays = (array.ctypes.data for array in (settings, memory, trace))
@@ -123,23 +123,6 @@ OPTIONS, OBSERVATION = (
 )
 
 
-class Stepping(NamedTuple):
-    """Compiled functions; `pointers` is explained in the module's docstring."""
-
-    step: Compiled
-    """Function (force, pointers) -> True if the new state is finite and within `MAX_STATE`.
-
-    It takes one environment step under a desired force [N or N*m], an array (n,) for several
-    actuators, and writes their signals to `trace`.
-    """
-    start: Compiled
-    """Function (state (n,), key, pointers) -> None that starts an episode like `Physics.reset`."""
-    read: Compiled
-    """Function (state (n,), pointers) -> None that fills `state` with the present state."""
-    read_sensors: Compiled
-    """Function (row of trace (n, c), readings (n, k), pointers) -> None that fills `readings`."""
-
-
 def compiled_stepping(simulation: SimulationConfig) -> Stepping:
     """Return the functions for simulations with these settings; each compiles on first use."""
     task, disturbed = simulation.task, simulation.disturbances != NO_DISTURBANCES
@@ -158,7 +141,7 @@ def compiled_stepping(simulation: SimulationConfig) -> Stepping:
     )
 
 
-def force_of(forces: Any, actuator: int) -> float:
+def force_of(forces: Force, actuator: int) -> float:
     """Return the force for an actuator: an entry of an array, or the number itself."""
     return forces[actuator] if isinstance(forces, np.ndarray) else forces
 
@@ -189,7 +172,7 @@ def _stepping(
     observe = compiled_observe(family) if family.OBSERVED else None
 
     @njit(nogil=True, error_model="numpy")
-    def step(force: Any, pointers: int) -> bool:
+    def step(force: Force, pointers: int) -> bool:
         model, data, settings, memory, trace = simulation_at(pointers)
         timestep = MODEL.opt.timestep(model)
         qpos, qvel, ctrl, act = DATA.qpos(data), DATA.qvel(data), DATA.ctrl(data), DATA.act(data)

@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from numba import types
 
+from codrl_mj.boundary import PickledState
 from codrl_mj.compile_cache import external_function, njit
 
 WORDS = 6
@@ -48,10 +49,10 @@ class Streams:
         # Copies and seeds replace the generators, so their addresses are read again.
         self._addresses = np.array(addresses, dtype=np.uintp)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> PickledState:
         return {"generators": self.generators}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: PickledState) -> None:
         self.__dict__.update(state)
         self._bind()
 
@@ -86,6 +87,7 @@ class Streams:
 
 def generator_words(generator: np.random.Generator) -> np.ndarray:
     """Return the state of a generator, shape (6,), uint64."""
+    # A mapping of names to numbers, words and mappings.
     pcg: Any = generator.bit_generator.state
     if pcg["bit_generator"] != "PCG64":
         raise ValueError(

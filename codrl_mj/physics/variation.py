@@ -3,7 +3,6 @@
 import copy
 import functools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from codrl_mj.actuators import IDEAL, ActuatorModel
 from codrl_mj.disturbances import UNMODIFIED_JOINT, Joint
 from codrl_mj.engine.hill import GRAVITY
+from codrl_mj.engine.mounting import joint_addresses
 from codrl_mj.physics.base import SimulationConfig
 from codrl_mj.physics.mjcf import hills, task_model
 from codrl_mj.tasks import TASKS
@@ -27,43 +27,6 @@ DYNAMIC_FIELDS = tuple(
     dict.fromkeys(name for names in _FIELDS.values() for name in names if name not in VISUAL_FIELDS)
 )
 """Fields that affect the dynamics."""
-
-
-class JointAddress(NamedTuple):
-    """Address of the model entry to which a motor adds one of its `JointAdditions`."""
-
-    field: str
-    """Name of the model field."""
-    field_index: int
-    """Index in the field."""
-    scale: float
-    """Factor from the motor's value to the model's value."""
-
-
-def joint_addresses(model: mujoco.MjModel, index: int) -> tuple[JointAddress | None, ...]:
-    """Return the addresses of an actuator's `JointAdditions`; None for one that the model lacks.
-
-    In the callback backend, all three are fields of the joint. In the plugin backend, inertia and
-    damping are fields of the actuator, which has its own gear.
-    """
-    kind, target = mujoco.mjtTrn(model.actuator_trntype[index]), int(model.actuator_trnid[index, 0])
-    friction_address: JointAddress | None = None
-    scale = abs(float(model.actuator_gear[model.actuator_outadr[index], 0]))
-    if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
-        dof = int(model.jnt_dofadr[target])
-        if model.actuator_plugin[index] < 0:
-            return tuple(
-                JointAddress(f"dof_{name}", dof, 1.0)
-                for name in ("armature", "damping", "frictionloss")
-            )
-        friction_address = JointAddress("dof_frictionloss", dof, scale)
-    elif kind == mujoco.mjtTrn.mjTRN_TENDON:
-        friction_address = JointAddress("tendon_frictionloss", target, scale)
-    return (
-        JointAddress("actuator_armature", index, 1.0),
-        JointAddress("actuator_damping", index, 1.0),
-        friction_address,
-    )
 
 
 @functools.cache
@@ -239,7 +202,9 @@ def _geoms_along_axis(model: mujoco.MjModel) -> dict[int, int]:
 
 def field_of(model: mujoco.MjModel, name: str) -> np.ndarray:
     """Return a live field of a model, by its name in `Variation.fields`."""
-    return getattr(model.opt if name.startswith("opt.") else model, name.removeprefix("opt."))
+    owner = model.opt if name.startswith("opt.") else model
+    field: np.ndarray = getattr(owner, name.removeprefix("opt."))
+    return field
 
 
 def write_fields(model: mujoco.MjModel, fields: Mapping[str, np.ndarray], row: int = 0) -> None:

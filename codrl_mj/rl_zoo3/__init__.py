@@ -8,14 +8,15 @@ wherever the package is installed. See docs/other_agents.md for details.
 """
 
 from importlib.resources import files
-from typing import Any
+
+from codrl_mj.boundary import JsonObject
 
 
-def read_hyperparameters(algorithm: str) -> dict[str, dict[str, Any]]:
+def read_hyperparameters(algorithm: str) -> dict[str, JsonObject]:
     """Return an algorithm's hyperparameters: environment id -> hyperparameter -> value."""
     import yaml
 
-    settings: dict[str, dict[str, Any]] = yaml.safe_load(
+    settings: dict[str, JsonObject] = yaml.safe_load(
         files(__name__).joinpath(f"{algorithm}.yml").read_text()
     )
     return settings

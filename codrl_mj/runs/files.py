@@ -9,8 +9,12 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
+from codrl_mj.boundary import Json, JsonObject
+
+Entry = TypeVar("Entry")
+"""Value in a mapping."""
 _DIGEST_KEY = "sha256"
 # Temporary names that tempfile makes from the prefix and suffix of `atomic_write`.
 _TEMPORARY = re.compile(r"\.(.+)-[a-z0-9_]{8}(\.[^.]+)?")
@@ -106,13 +110,13 @@ def check_page(path: Path) -> None:
     check_file(path)
 
 
-def write_json(path: Path, content: Any) -> None:
+def write_json(path: Path, content: Json) -> None:
     """Write `content` atomically as indented JSON."""
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n")
 
 
-def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
+def with_digest(content: Mapping[str, Json]) -> JsonObject:
     """Return the content with its digest as the entry `sha256`, which `read_json` checks."""
     # Hash the content as it is after a round trip through JSON: keys are strings, tuples are lists.
     json_content = json.loads(json.dumps(content))
@@ -122,7 +126,7 @@ def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def check_digest(path: Path, content: bytes, expected: Any, description: str) -> None:
+def check_digest(path: Path, content: bytes, expected: object, description: str) -> None:
     """Raise if a file's content does not have the expected SHA-256; None accepts any content.
 
     Args:
@@ -139,7 +143,7 @@ def check_digest(path: Path, content: bytes, expected: Any, description: str) ->
         )
 
 
-def select_prefix(prefix: str, content: Mapping[str, Any]) -> dict[str, Any]:
+def select_prefix(prefix: str, content: Mapping[str, Entry]) -> dict[str, Entry]:
     """Return the entries whose names have a prefix, without the prefix."""
     return {
         name.removeprefix(prefix): value
@@ -148,7 +152,7 @@ def select_prefix(prefix: str, content: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def read_json(path: Path, kind: str) -> Any:
+def read_json(path: Path, kind: str) -> Json:
     """Read JSON; check and remove the digest of `with_digest`, if any.
 
     Args:

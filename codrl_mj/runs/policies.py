@@ -15,10 +15,18 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import allow_imports
 from codrl_mj.agents import AgentConfig, agent_from_mapping
+from codrl_mj.agents.base import AgentPolicy, Space
+from codrl_mj.boundary import JsonObject
+from codrl_mj.envs.config import Env
 from codrl_mj.runs import DESCRIPTION, DIGEST, WEIGHTS
 from codrl_mj.runs.files import atomic_write, check_digest, read_json, with_digest, write_json
 
 FORMAT = "codrl_mj policy 2"
+# Stable-Baselines3 takes seconds to import, and mypy does not read it.
+SavedModel = Any
+"""A Stable-Baselines3 `BaseAlgorithm`."""
+SavedNormalization = Any
+"""A Stable-Baselines3 `VecNormalize`, the statistics of the observations in a training."""
 _ENTRIES = {"format", DIGEST, "agent", "observation_space", "action_space"}
 
 
@@ -27,11 +35,11 @@ class Policy(Protocol):
 
     def predict(
         self, observation: np.ndarray, *, deterministic: bool = False
-    ) -> tuple[np.ndarray, Any]:
+    ) -> tuple[np.ndarray, object]:
         """Return actions (N, ...) for observations (N, k), and a state, which callers ignore."""
 
 
-def _describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
+def _describe_space(space: Space) -> JsonObject:
     if isinstance(space, spaces.Discrete):
         return {"type": "Discrete", "n": int(space.n)}
     if isinstance(space, spaces.Box):
@@ -44,7 +52,7 @@ def _describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
     raise ValueError(f"a policy over {space} cannot be saved: only Box and Discrete spaces can")
 
 
-def _make_space(description: dict[str, Any]) -> spaces.Space[Any]:
+def _make_space(description: JsonObject) -> Space:
     if description["type"] == "Discrete":
         return spaces.Discrete(description["n"])
     dtype = np.dtype(description["dtype"]).type
@@ -53,7 +61,7 @@ def _make_space(description: dict[str, Any]) -> spaces.Space[Any]:
     )
 
 
-def save_policy(policy: Any, agent: AgentConfig, folder: Path) -> None:
+def save_policy(policy: AgentPolicy, agent: AgentConfig, folder: Path) -> None:
     """Write a policy as `policy.safetensors` and `policy.json`, with digests of both.
 
     Args:
@@ -76,7 +84,7 @@ def save_policy(policy: Any, agent: AgentConfig, folder: Path) -> None:
     write_json(folder / DESCRIPTION, with_digest(description))
 
 
-def load_policy(folder: Path, trust: bool = False) -> Any:
+def load_policy(folder: Path, trust: bool = False) -> Policy:
     """Load a policy written by `save_policy`, without executing anything in the files.
 
     Args:
@@ -144,21 +152,23 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
 class NormalizedPolicy:
     """Policy with the observation statistics of Stable-Baselines3's `VecNormalize`."""
 
-    def __init__(self, policy: Any, statistics: Any) -> None:
+    def __init__(self, policy: AgentPolicy, statistics: SavedNormalization) -> None:
         """Combine a policy with the `VecNormalize` of its training."""
         self.policy, self.statistics = policy, statistics
         self.observation_space, self.action_space = policy.observation_space, policy.action_space
 
     def predict(
         self, observation: np.ndarray, *, deterministic: bool = False
-    ) -> tuple[np.ndarray, Any]:
+    ) -> tuple[np.ndarray, object]:
         """Return the policy's actions for raw observations."""
         return self.policy.predict(
             self.statistics.normalize_obs(observation), deterministic=deterministic
         )
 
 
-def load_sb3_zip(path: Path, agent: str, trust: bool, normalize: Path | str | None = None) -> Any:
+def load_sb3_zip(
+    path: Path, agent: str, trust: bool, normalize: Path | str | None = None
+) -> Policy:
     """Load the policy of a model that Stable-Baselines3 saved as a zip.
 
     Args:
@@ -182,28 +192,27 @@ def load_sb3_zip(path: Path, agent: str, trust: bool, normalize: Path | str | No
     import stable_baselines3
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-    kind: Any = getattr(stable_baselines3, agent.upper(), None)
+    kind: type[SavedModel] | None = getattr(stable_baselines3, agent.upper(), None)
     if not isinstance(kind, type) or not issubclass(kind, BaseAlgorithm):
         raise ValueError(
             f"agent = {agent!r}: Stable-Baselines3 has no such agent; name the agent that saved"
             f" {path}"
         )
     try:
-        model = kind.load(path, device="cpu")  # type: ignore[attr-defined]
+        model = kind.load(path, device="cpu")
     # Unpickled objects can raise any exception.
     except Exception as error:
         raise ValueError(f"{path} is not a model of {agent}: {error!r}") from None
     model.policy.set_training_mode(False)
     if normalize is None:
         _check_normalization(path, model)
+    policy: AgentPolicy = model.policy
     if normalize in (None, "none"):
-        return model.policy
-    return NormalizedPolicy(
-        model.policy, _load_statistics(Path(str(normalize)), model.observation_space)
-    )
+        return policy
+    return NormalizedPolicy(policy, _load_statistics(Path(str(normalize)), model.observation_space))
 
 
-def _load_statistics(path: Path, space: spaces.Space[Any]) -> Any:
+def _load_statistics(path: Path, space: Space) -> SavedNormalization:
     """Unpickle a `VecNormalize` for observations of a space; only for trusted files."""
     from stable_baselines3.common.vec_env import VecNormalize
 
@@ -223,12 +232,12 @@ def _load_statistics(path: Path, space: spaces.Space[Any]) -> Any:
         raise ValueError(
             f"--normalize {path}: holds a {kind}: must be a file that VecNormalize.save wrote"
         )
-    mean: Any = (
+    mean: object = (
         getattr(statistics.obs_rms, "mean", None)
         if statistics.norm_obs
         else np.zeros(space.shape or ())
     )
-    if np.shape(mean) != space.shape:
+    if np.asarray(mean).shape != space.shape:
         raise ValueError(
             f"--normalize {path}: is for {statistics.observation_space}, but the policy observes"
             f" {space}: name the file that was saved with the policy"
@@ -236,7 +245,7 @@ def _load_statistics(path: Path, space: spaces.Space[Any]) -> Any:
     return statistics
 
 
-def _check_normalization(path: Path, model: Any) -> None:
+def _check_normalization(path: Path, model: SavedModel) -> None:
     """Raise if a model was probably trained with `VecNormalize`; warn if that is unknown."""
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
@@ -269,7 +278,7 @@ def _check_normalization(path: Path, model: Any) -> None:
         )
 
 
-def check_spaces(policy: Any, env: Any, exact: bool = True) -> None:
+def check_spaces(policy: object, env: Env, exact: bool = True) -> None:
     """Raise if the spaces of an environment differ from those of a policy's training.
 
     A space that the policy does not have is not compared. If `exact` is False, a difference
@@ -295,7 +304,7 @@ def check_spaces(policy: Any, env: Any, exact: bool = True) -> None:
         warnings.warn(text, stacklevel=4)
 
 
-def _is_same(space: Any, other_space: Any, bounds: bool = True) -> bool:
+def _is_same(space: Space, other_space: Space, bounds: bool = True) -> bool:
     """Return True if two spaces have the same elements, up to rounding to float32."""
     if not (isinstance(space, spaces.Box) and isinstance(other_space, spaces.Box)):
         return bool(space == other_space)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from codrl_mj.actuators import actuator_from_mapping, allow_imports, display_name
+from codrl_mj.boundary import Json, JsonObject
 from codrl_mj.envs.patterns import pattern_mapping
 from codrl_mj.fields import flatten
 from codrl_mj.runs import (
@@ -60,9 +61,9 @@ class RunSummary:
     """Wall-clock time of the training [s]."""
     modified: float | None = None
     """Time of the last change of a file [s since 1970]."""
-    evaluation: Mapping[str, Any] | None = None
+    evaluation: Mapping[str, Json] | None = None
     """`Evaluation.as_mapping()` of the last policy."""
-    configuration: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    configuration: Mapping[str, object] = dataclasses.field(default_factory=dict)
     """Fields of the training configuration and software versions, by dotted name."""
 
     @property
@@ -71,7 +72,7 @@ class RunSummary:
         returns = (self.evaluation or {}).get("returns")
         return _number(returns.get("mean")) if isinstance(returns, Mapping) else None
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> JsonObject:
         """Return the summary as JSON-serializable values; `modified` in ISO 8601, UTC."""
         modified = None
         if self.modified is not None:
@@ -96,7 +97,7 @@ def find_runs(root: Path) -> list[RunSummary]:
     return sorted(runs, key=lambda run: run.name)
 
 
-def median_seed(evaluation: Mapping[str, Any] | None) -> int | None:
+def median_seed(evaluation: Mapping[str, Json] | None) -> int | None:
     """Return the seed of the evaluated episode with the (lower) median return; None if unknown."""
     returns, conditions = (
         (evaluation or {}).get(name) for name in ("episode_returns", "conditions")
@@ -109,7 +110,7 @@ def median_seed(evaluation: Mapping[str, Any] | None) -> int | None:
     return seed + sorted(range(len(returns)), key=returns.__getitem__)[(len(returns) - 1) // 2]
 
 
-def describe_rank(evaluation: Mapping[str, Any] | None, total: float) -> str:
+def describe_rank(evaluation: Mapping[str, Json] | None, total: float) -> str:
     """Return a text that compares an episode's return with an evaluation; "" without evaluation."""
     if (seed := median_seed(evaluation)) is None or evaluation is None:
         return ""
@@ -122,7 +123,7 @@ def describe_rank(evaluation: Mapping[str, Any] | None, total: float) -> str:
     )
 
 
-def read_evaluation(run: Path, best: bool) -> Mapping[str, Any] | None:
+def read_evaluation(run: Path, best: bool) -> Mapping[str, Json] | None:
     """Return the evaluation of a run's last or best policy; None if missing or unreadable."""
     return _mapping((run / BEST if best else run) / EVALUATION, "policy evaluation", [])
 
@@ -198,7 +199,7 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
     )
 
 
-def _mapping(path: Path, kind: str, problems: list[str]) -> Mapping[str, Any] | None:
+def _mapping(path: Path, kind: str, problems: list[str]) -> Mapping[str, Json] | None:
     """Return the mapping in a JSON file; None if it is missing or damaged (added to `problems`)."""
     try:
         content = read_json(path, kind)
@@ -232,7 +233,7 @@ def read_progress(path: Path, problems: list[str]) -> list[Mapping[str, str]]:
     return [row for row in rows if None not in row and None not in row.values()]
 
 
-def _number(value: Any) -> float | None:
+def _number(value: Json) -> float | None:
     """Convert a value to a finite number; None if that is impossible."""
     try:
         number = float(value)
@@ -241,7 +242,7 @@ def _number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _whole(value: Any) -> int | None:
+def _whole(value: Json) -> int | None:
     """Convert a value to an integer; None if that is impossible."""
     number = _number(value)
     return None if number is None else int(number)
@@ -258,13 +259,13 @@ def _modified(folder: Path) -> float | None:
     return max(times, default=None)
 
 
-def _first(name: str, *sources: Mapping[str, Any] | None) -> float | None:
+def _first(name: str, *sources: Mapping[str, Json] | None) -> float | None:
     """Return the first finite number among the mappings' values of a key; None if there is none."""
     numbers = (_number((source or {}).get(name)) for source in sources)
     return next((number for number in numbers if number is not None), None)
 
 
-def _actuator_of(env: Mapping[str, Any], task: str | None, labels: Any) -> str | None:
+def _actuator_of(env: Mapping[str, Json], task: str | None, labels: object) -> str | None:
     """Return the names of an environment's actuators, by motor or by pattern of motors."""
     if "actuator" not in env:
         return None
@@ -295,6 +296,9 @@ def _actuator_of(env: Mapping[str, Any], task: str | None, labels: Any) -> str |
 
 SORT_KEYS = ("name", "task", "agent", "actuator", "state", "steps", "return", "seconds", "modified")
 """Keys for sorting runs."""
+# Type checkers have no name for the types whose values can be compared with each other.
+Comparable = Any
+"""Value that sorting compares with other ones of its kind."""
 _HIGHEST_FIRST = ("steps", "return", "seconds", "modified")
 
 
@@ -306,7 +310,7 @@ def sort_runs(runs: Sequence[RunSummary], key: str) -> list[RunSummary]:
     if key not in SORT_KEYS:
         raise ValueError(f"sort = {key!r}: must be one of {', '.join(SORT_KEYS)}")
 
-    def value(run: RunSummary) -> Any:
+    def value(run: RunSummary) -> Comparable:
         if key != "return":
             return getattr(run, key)
         return run.mean_return if run.evaluation_return is None else run.evaluation_return
@@ -323,9 +327,9 @@ class Comparison:
 
     names: tuple[str, ...]
     """Names of the runs."""
-    configuration: Mapping[str, tuple[Any, ...]]
+    configuration: Mapping[str, tuple[Json, ...]]
     """Dotted name of a differing setting -> values."""
-    results: Mapping[str, tuple[Any, ...]]
+    results: Mapping[str, tuple[Json, ...]]
     """Name of a result -> values; a measure is a number, or a mapping with mean and interval."""
     units: Mapping[str, str]
     """Name of a result -> unit."""
@@ -346,7 +350,7 @@ def compare(runs: Sequence[RunSummary]) -> Comparison:
         key: tuple(entry.get(key) for entry in named)
         for key in dict.fromkeys(key for entry in named for key in entry)
     }
-    results: dict[str, tuple[Any, ...]] = {
+    results: dict[str, tuple[Json, ...]] = {
         name: tuple(getattr(run, name) for run in runs)
         for name in ("state", "problem", "steps", "mean_return", "seconds")
     }

@@ -4,11 +4,11 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import Drive, named_mapping, set_display_name
+from codrl_mj.actuators import ActuatorSetting, Drive, named_mapping, set_display_name
 from codrl_mj.catalogue import MotorEntry, motor_names
 from codrl_mj.sizing.demand import Demand
 from codrl_mj.sizing.feasibility import (
@@ -70,14 +70,16 @@ class Candidate(NamedTuple):
         return 1.0 / self.drive.arm_radius
 
 
-def actuators_of(choices: Mapping[str, tuple[Candidate, Demand]]) -> dict[str, Any]:
+def actuators_of(
+    choices: Mapping[str, tuple[Candidate, Demand]],
+) -> dict[str, ActuatorSetting]:
     """Return pattern -> fields of the actuator, as `codrl_mj.make` and `--actuators` accept it.
 
     Args:
         choices: name of a motor in the model -> chosen candidate and its demand; the name may be
             empty if there is only one motor.
     """
-    actuators = {}
+    actuators: dict[str, ActuatorSetting] = {}
     for name, (choice, demand) in choices.items():
         drive = set_display_name(choice.for_model_gear(demand.model_gear), Path(choice.name).stem)
         actuators[" & ".join(map(re.escape, name.split(" & "))) if name else ".*"] = named_mapping(

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from codrl_mj.actuators import IDEAL
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.evaluation import at_goal, run_episodes
+from codrl_mj.evaluation import Episode, at_goal, run_episodes
 from codrl_mj.fields import did_you_mean
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.sizing.scripted import Scripted, observe_state
@@ -176,7 +177,9 @@ def with_motor_steps(env: EnvConfig) -> EnvConfig:
     return dataclasses.replace(env, physics="mujoco", inner_steps=task.motor_inner_steps)
 
 
-def demand_from_arrays(time: Any, torque: Any, speed: Any, source: str = "a recording") -> Demand:
+def demand_from_arrays(
+    time: ArrayLike, torque: ArrayLike, speed: ArrayLike, source: str = "a recording"
+) -> Demand:
     """Return a demand from arrays, to be followed exactly.
 
     Args:
@@ -215,7 +218,9 @@ def demand_from_arrays(time: Any, torque: Any, speed: Any, source: str = "a reco
     return Demand(source, duration, arrays["torque"], arrays["speed"], acceleration, exact=True)
 
 
-def _demands_from_episodes(source: str, env: Any, episodes: Sequence[Any]) -> dict[str, Demand]:
+def _demands_from_episodes(
+    source: str, env: EnvConfig, episodes: Sequence[Episode]
+) -> dict[str, Demand]:
     """Return the demands on all motors from episodes of one environment."""
     import mujoco
 
@@ -229,6 +234,7 @@ def _demands_from_episodes(source: str, env: Any, episodes: Sequence[Any]) -> di
             f" {len(episodes)} episodes at the goal"
         )
     with contextlib.closing(env.build()) as opened_env:
+        # The model, and the pendulum's properties, are attributes of the environment's own class.
         core: Any = opened_env.unwrapped
         if env.task == "pendulum":
             # A thin uniform rod about its end: inertia m*l^2/3, center of mass at l/2.

@@ -3,13 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import Drive, GearMotor
 from codrl_mj.sizing.demand import Demand
-from codrl_mj.sizing.limits import max_power
+from codrl_mj.sizing.limits import Number, max_power
 from codrl_mj.sizing.swing import Swing, min_energy_gain, min_pumped_energy, min_supply_voltage
 
 
@@ -75,15 +75,16 @@ def operating_points(demand: Demand, drive: Drive) -> OperatingPoints:
     )
 
 
-def best_ratio(torque: Any, speed: Any, motor: GearMotor) -> Any:
+def best_ratio(torque: Number, speed: Number, motor: GearMotor) -> Number:
     """Return the gear ratio N that needs the lowest voltage for a torque [N*m] and a speed [rad/s].
 
     It minimizes R tau/(N kT) + N kE omega over N, without rotor inertia and friction; the minimum
     is 2 N kE omega.
     """
-    return np.sqrt(
+    ratio: Number = np.sqrt(
         motor.resistance * torque / (motor.torque_constant * motor.back_emf_constant * speed)
     )
+    return ratio
 
 
 # -- bounds ----------------------------------------------------------------------------------------
@@ -268,7 +269,18 @@ _EASED_BY_SERVO = ("voltage", "current", "rotor", "power")
 """Bounds whose needed value a position or velocity servo lowers: on an ideal motor it moves as
 fast as its force allows, on a real motor it moves more slowly and needs less.
 """
-_Row = tuple[str, str, Any, float, str, tuple[str, str], str]
+
+
+class _Condition(NamedTuple):
+    """Condition on a motor that has not been judged yet."""
+
+    name: str
+    formula: str
+    load: float | np.ndarray  # loads, of which the largest must not exceed the available value
+    available: float
+    unit: str
+    verdicts: tuple[str, str]  # if it holds, and if not
+    remedy: str
 
 
 def _conditions(
@@ -277,8 +289,8 @@ def _conditions(
     required: OperatingPoints,
     continuous: float | None,
     unmet_verdict: str,
-) -> Iterator[_Row]:
-    """Yield name, formula, load, available, unit, verdicts and remedy of the general bounds.
+) -> Iterator[_Condition]:
+    """Yield the conditions of the general bounds.
 
     Sufficient together: voltage and current at every operating point, heat and, unless the demand
     is exact, the shares of rotor and friction. Necessary to follow the demand exactly: torque at
@@ -288,7 +300,7 @@ def _conditions(
     currents, unit = np.abs(required.current), "N" if demand.linear else "N*m"
     volts, largest = float(required.voltage.max()), float(currents.max())
     remedy = f"raise the supply to {volts:.4g} V{_time_within(required.voltage, limit, 'V')}"
-    yield (
+    yield _Condition(
         "voltage",
         "|R i + L di/dt + N kE omega|, largest",
         required.voltage,
@@ -302,7 +314,9 @@ def _conditions(
         f" {largest / max_current:.3g} times"
     )
     remedy += _time_within(currents, max_current, "A")
-    yield "current", "|i|, largest", currents, max_current, "A", (SURELY, unmet_verdict), remedy
+    yield _Condition(
+        "current", "|i|, largest", currents, max_current, "A", (SURELY, unmet_verdict), remedy
+    )
     rating = math.nan
     remedy = f"its continuous current is not known, must be at least {required.rms_current:.3g} A"
     if continuous is not None:
@@ -310,7 +324,7 @@ def _conditions(
         remedy = (
             f"let it rest, cool it, or raise the gear {required.rms_current / continuous:.3g} times"
         )
-    yield "heat", "i, rms", required.rms_current, rating, "A", (SURELY, TRY_IT), remedy
+    yield _Condition("heat", "i, rms", required.rms_current, rating, "A", (SURELY, TRY_IT), remedy)
     if not demand.exact:
         yield from _share_bounds(drive, demand, required)
     # Where power < 0 the motor brakes, which needs less than driving.
@@ -324,7 +338,9 @@ def _conditions(
     stall_torque -= motor.stribeck_friction / drive.arm_radius
     verdicts = TRY_IT, unmet_verdict if stall_torque > 0.0 else SURELY_NOT
     remedy = "raise the supply, the largest current or the gear"
-    yield "stall", "|tau| except braking, largest", driving, stall_torque, unit, verdicts, remedy
+    yield _Condition(
+        "stall", "|tau| except braking, largest", driving, stall_torque, unit, verdicts, remedy
+    )
     peak = int(np.argmax(power))
     torque = abs(float(demand.torque[peak])) / motor.gear_efficiency
     speed = abs(float(demand.speed[peak]))
@@ -341,7 +357,7 @@ def _conditions(
         " stronger motor"
     )
     remedy = remedy if demand.exact else f"to follow this run exactly, {remedy}"
-    yield (
+    yield _Condition(
         "power",
         "tau omega / eta, largest",
         needed,
@@ -360,7 +376,7 @@ def _time_within(load: np.ndarray, available: float, unit: str) -> str:
     )
 
 
-def _share_bounds(drive: Drive, demand: Demand, required: OperatingPoints) -> Iterator[_Row]:
+def _share_bounds(drive: Drive, demand: Demand, required: OperatingPoints) -> Iterator[_Condition]:
     """Yield the bounds on the shares of the largest load that rotor and friction take."""
     # With x times the gear ratio, the inertial part grows by x^2 and the friction by x. The scale
     # is the positive root of inertial*x^2 + friction*x = MAX_ROTOR_SHARE.
@@ -396,7 +412,7 @@ def _share_bounds(drive: Drive, demand: Demand, required: OperatingPoints) -> It
             else "take a smaller motor"
         )
         formula, remedy = f"{formula}, share of the largest load", f"{remedy}, or {alternative}"
-        yield name, formula, 100.0 * share, 100.0 * limit, "%", (SURELY, TRY_IT), remedy
+        yield _Condition(name, formula, 100.0 * share, 100.0 * limit, "%", (SURELY, TRY_IT), remedy)
 
 
 def friction_share(drive: Drive, demand: Demand) -> float:

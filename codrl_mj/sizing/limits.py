@@ -9,20 +9,34 @@ opposes the speed. All torques in this module act on the load, net of both losse
 import dataclasses
 import math
 import re
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, NotRequired, TypedDict, TypeVar, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from codrl_mj.actuators import Drive, GearMotor, Servo, ServoLoop, override_actuator, resolve
+from codrl_mj.actuators import (
+    ActuatorModel,
+    Drive,
+    GearMotor,
+    Servo,
+    ServoLoop,
+    override_actuator,
+    resolve,
+)
 from codrl_mj.catalogue import MotorEntry, MotorParameters, motor_entry, motor_names
 from codrl_mj.catalogue.datasheet import QUANTITY_SPECS
 from codrl_mj.catalogue.derivation import PRINTED_NAMES
 from codrl_mj.fields import check_names
 
+Number = TypeVar("Number", float, np.ndarray)
+"""A number or an array; a function of it has the same type."""
+ActuatorSetting = str | type[ActuatorModel] | ActuatorModel | Mapping[str, object]
+"""Name of an actuator, its family, itself, or a mapping of its fields: see `resolve`."""
+
 
 def find_drive(
-    name: Any,
+    name: ActuatorSetting,
     gear_ratio: float | None = None,
     sample_rate: float | None = None,
     bandwidth: float | None = None,
@@ -58,7 +72,7 @@ def find_drive(
         "controller": loop,
         "supply": {"voltage": voltage},
     }
-    base = resolve(name, None, "a motor on its own")
+    base: ActuatorModel = resolve(name, None, "a motor on its own")
     if isinstance(base, Servo):
         base = override_actuator(base, {"family": Drive.family})
     if type(base) is not Drive:
@@ -71,13 +85,14 @@ def find_drive(
         part: {key: value for key, value in fields.items() if value is not None}
         for part, fields in changes.items()
     }
-    return override_actuator(base, overrides)
+    return cast(Drive, override_actuator(base, overrides))
 
 
-def find_entry(name: Any) -> MotorEntry | None:
+def find_entry(name: object) -> MotorEntry | None:
     """Return the datasheet behind a name of `find_drive`; None if it has no datasheet."""
-    known = isinstance(name, str) and (name in motor_names() or name.endswith(".toml"))
-    return motor_entry(name) if known else None
+    if isinstance(name, str) and (name in motor_names() or name.endswith(".toml")):
+        return motor_entry(name)
+    return None
 
 
 class DriveLimits(NamedTuple):
@@ -160,15 +175,22 @@ def continuous_torque(drive: Drive, current: float | None) -> float | None:
     )
 
 
-def diagram_limits(drive: Drive, parameters: Any = None) -> list[tuple[str, float, int]]:
-    """Return the limits of a drive for a torque-speed diagram, as (name, current [A], kind).
+class DiagramLimit(NamedTuple):
+    """Limit of a drive in a torque-speed diagram."""
 
-    The kind is 0 for the voltage limit, whose current is infinite, 1 for the peak current and 2 for
-    the continuous current.
+    name: str
+    current: float
+    """Current [A]; infinite for the limit by the voltage."""
+    kind: int
+    """0 for the voltage limit, 1 for the peak current, 2 for the continuous current."""
+
+
+def diagram_limits(drive: Drive, parameters: MotorParameters | None = None) -> list[DiagramLimit]:
+    """Return the limits of a drive for a torque-speed diagram.
 
     Args:
         drive: drive.
-        parameters: `MotorParameters` of its datasheet; None leaves out the continuous current.
+        parameters: parameters of its datasheet; None leaves out the continuous current.
 
     Raises:
         ValueError: the no-load speed, at which the diagram ends, is not finite or not positive.
@@ -181,19 +203,17 @@ def diagram_limits(drive: Drive, parameters: Any = None) -> list[tuple[str, floa
             f" stall torque {limits.stall_torque:g} N*m, must be finite and > 0 for a torque-speed"
             " diagram; give a back-EMF constant, and a voltage that overcomes the friction"
         )
-    lines = [(f"voltage, {drive.voltage_limit:g} V", math.inf, 0)]
+    lines = [DiagramLimit(f"voltage, {drive.voltage_limit:g} V", math.inf, 0)]
     if math.isfinite(peak_current):
-        lines.append((f"peak current, {peak_current:.3g} A", peak_current, 1))
-    continuous = getattr(parameters, "continuous_current", None)
-    return (
-        lines
-        if continuous is None
-        else [*lines, (f"continuous current, {continuous:.3g} A", continuous, 2)]
-    )
+        lines.append(DiagramLimit(f"peak current, {peak_current:.3g} A", peak_current, 1))
+    continuous = None if parameters is None else parameters.continuous_current
+    if continuous is not None:
+        lines.append(DiagramLimit(f"continuous current, {continuous:.3g} A", continuous, 2))
+    return lines
 
 
 def torque_limits(
-    drive: Drive, speeds: Any, current: float = math.inf
+    drive: Drive, speeds: ArrayLike, current: float = math.inf
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest steady torque [N*m] at the output.
 
@@ -222,7 +242,8 @@ def highest_current(
     steady = (voltage - back_emf) / np.where(
         back_emf > voltage, reverse_resistance, resistance + supply_resistance
     )
-    return np.maximum(steady, -back_emf / resistance)
+    highest: np.ndarray = np.maximum(steady, -back_emf / resistance)
+    return highest
 
 
 def _at_output(motor: GearMotor, current: np.ndarray, speed: np.ndarray) -> np.ndarray:
@@ -235,7 +256,9 @@ def _at_output(motor: GearMotor, current: np.ndarray, speed: np.ndarray) -> np.n
     friction = friction + motor.stribeck(motor.gear_ratio * speed)
     # At standstill friction only cancels torque; it never moves the joint.
     static = np.sign(torque) * np.maximum(np.abs(torque) - friction, 0.0)
-    return motor.gear_ratio * np.where(speed == 0.0, static, torque - friction * np.sign(speed))
+    moving = torque - friction * np.sign(speed)
+    net: np.ndarray = motor.gear_ratio * np.where(speed == 0.0, static, moving)
+    return net
 
 
 # -- datasheets ------------------------------------------------------------------------------------
@@ -259,7 +282,12 @@ _ROUNDED = 0.01
 """Relative difference below which a contradiction in a datasheet is attributed to rounding."""
 
 
-def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
+# Names and kinds are texts, and the other values numbers or None; callers loop over the columns.
+CatalogueRow = dict[str, Any]
+"""Row of the catalogue, with the keys `COLUMNS`."""
+
+
+def catalogue_rows(sort: str = "name") -> list[CatalogueRow]:
     """Return a row for each catalogue motor at its nominal voltage, or at 24 V.
 
     Unknown values are None.
@@ -271,7 +299,7 @@ def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
         ValueError: the column is unknown; the nearest name is suggested.
     """
     check_names([sort], COLUMNS, "column")
-    rows = []
+    rows: list[CatalogueRow] = []
     for entry in map(motor_entry, motor_names()):
         parameters, drive = entry.parameters, Drive.from_motor_parameters(entry.parameters)
         limits = drive_limits(drive)._asdict()
@@ -284,36 +312,67 @@ def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: (row[sort] is None, -(row[sort] or 0.0)))
 
 
-def find_loop(name: Any) -> ServoLoop | None:
+def find_loop(name: ActuatorSetting) -> ServoLoop | None:
     """Return the outer loops of the servo with a name of `find_drive`; None for other actuators."""
-    base = resolve(name, None, "a motor on its own")
+    base: ActuatorModel = resolve(name, None, "a motor on its own")
     return base.loop if isinstance(base, Servo) else None
+
+
+class Quantity(TypedDict):
+    """Value of a report."""
+
+    name: str
+    value: object
+    """A number; for a drive also a text, True, False or None."""
+    unit: str
+
+
+class CitedQuantity(Quantity):
+    """Value of a datasheet."""
+
+    how: str
+    """Derivation of the value."""
+    sources: list[str]
+    places: str
+    """Numbers of these sources in the list `MotorReport.cited`, counted from 1."""
+
+
+class MotorReport(TypedDict):
+    """All known data of a motor; the keys after `assumed` exist only with a datasheet."""
+
+    drive: list[Quantity]
+    """Fields of motor, controller, supply and loop."""
+    abilities: list[Quantity]
+    assumed: str
+    manufacturer: NotRequired[str]
+    product: NotRequired[str]
+    kind: NotRequired[str]
+    numbers: NotRequired[list[CitedQuantity]]
+    cited: NotRequired[list[str]]
+    """Sources of the numbers."""
+    unknown: NotRequired[list[str]]
+    disagreements: NotRequired[list[str]]
+    estimated: NotRequired[dict[str, str]]
+    notes: NotRequired[str]
 
 
 def describe_motor(
     drive: Drive, entry: MotorEntry | None = None, loop: ServoLoop | None = None
-) -> dict[str, Any]:
+) -> MotorReport:
     """Return all known data of a motor as JSON-serializable values, of which some may be infinite.
 
     Args:
         drive: drive with motor, controller and supply.
         entry: datasheet of the motor, or None.
         loop: outer loops of a servo, or None.
-
-    Returns:
-        `drive` (the fields of motor, controller, supply and loop) and `abilities`, each a list of
-        mappings with `name`, `value` and `unit`; `assumed`; and for a datasheet `manufacturer`,
-        `product`, `kind`, `numbers`, `cited`, `unknown`, `disagreements`, `estimated` and `notes`.
-        Each mapping in `numbers` also has its derivation `how`, its `sources`, and `places`: the
-        numbers of these sources in the list `cited`, counted from 1.
     """
-    parts: dict[str, Any] = {
+    parts = {
         "motor": drive.motor,
         "controller": drive.controller,
         "supply": drive.supply,
+        "loop": loop,
     }
-    parts["loop"] = loop
-    report: dict[str, Any] = {
+    report: MotorReport = {
         "drive": [
             _value(
                 f"{part}.{field.name}", getattr(owner, field.name), field.metadata.get("unit", "")
@@ -352,15 +411,16 @@ def describe_motor(
     ]
     if rounded:
         reported.append(f"less than {_ROUNDED:.0%}, by rounding: {', '.join(rounded)}")
-    return report | {
-        **{name: getattr(entry, name) for name in ("manufacturer", "product", "kind")},
+    return {
+        **report,
+        "manufacturer": entry.manufacturer,
+        "product": entry.product,
+        "kind": entry.kind,
         "numbers": [
-            _value(
-                name,
-                getattr(entry.parameters, name),
-                QUANTITY_SPECS[PRINTED_NAMES.get(name, name)].unit,
-            )
-            | {
+            {
+                "name": name,
+                "value": getattr(entry.parameters, name),
+                "unit": QUANTITY_SPECS[PRINTED_NAMES.get(name, name)].unit,
                 "how": derived[name],
                 "sources": value_sources,
                 "places": ", ".join(str(1 + cited.index(citation)) for citation in value_sources),
@@ -383,7 +443,7 @@ def describe_unknown(names: Sequence[str]) -> str:
     )
 
 
-def _value(name: str, value: Any, unit: str) -> dict[str, Any]:
+def _value(name: str, value: object, unit: str) -> Quantity:
     """Return an entry of a report."""
     return {"name": name, "value": value, "unit": unit}
 

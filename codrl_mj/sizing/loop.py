@@ -11,16 +11,21 @@ mechanical timestep [s].
 
 import dataclasses
 import math
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import DCMotorActuator, Drive, Inputs, parameters_type
+from codrl_mj.actuators.parameters import family_of
 from codrl_mj.actuators.sampled import designed_gains
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 from codrl_mj.fields import check_memory
 
 CurrentLoopActuator = Drive | DCMotorActuator
+# mypy does not read python-control.
+TransferFunction = Any
+"""A `control.TransferFunction`."""
 # Memory [bytes] of the step responses with all kinds of anti-windup, for each sample.
 _SAMPLE_SIZE = 500
 RATES = (10e3, 20e3, 40e3)
@@ -139,7 +144,7 @@ def _sampled(actuator: CurrentLoopActuator, timestep: float | None) -> _Sampled:
     )
 
 
-def open_loop(actuator: CurrentLoopActuator, timestep: float | None = None) -> Any:
+def open_loop(actuator: CurrentLoopActuator, timestep: float | None = None) -> TransferFunction:
     """Return the transfer function from error to sampled current, in z."""
     import control
 
@@ -147,7 +152,7 @@ def open_loop(actuator: CurrentLoopActuator, timestep: float | None = None) -> A
     return control.TransferFunction(loop.numerator, loop.denominator, 1.0 / loop.rate)
 
 
-def closed_loop(actuator: CurrentLoopActuator, timestep: float | None = None) -> Any:
+def closed_loop(actuator: CurrentLoopActuator, timestep: float | None = None) -> TransferFunction:
     """Return the transfer function from reference to sampled current, in z."""
     import control
 
@@ -199,7 +204,7 @@ class Response(NamedTuple):
 
 def simulate_loop(
     actuator: CurrentLoopActuator,
-    references: Any,
+    references: Sequence[float] | np.ndarray,
     speed: float = 0.0,
     timestep: float | None = None,
 ) -> Response:
@@ -212,6 +217,7 @@ def simulate_loop(
         timestep: mechanical timestep of a `DCMotorActuator` [s]; not used for a drive.
     """
     period = 1.0 / _sampled(actuator, timestep).rate
+    # The states of the two classes have different fields.
     state_type: Any = actuator.State
     state = state_type(*[0.0] * len(state_type._fields))
     if isinstance(actuator, Drive):
@@ -225,8 +231,7 @@ def simulate_loop(
         actuator = actuator.replaced(
             {f"controller.{name}": value for name, value in exact_sensor.items()}
         )
-    family: Any = type(actuator)
-    parameters, rows = parameters_type(family)(*actuator.parameter_values), []
+    parameters, rows = parameters_type(family_of(actuator))(*actuator.parameter_values), []
     for reference in references:
         sampled_current = state.current
         torque = actuator.motor.torque_constant * float(reference)
@@ -338,12 +343,13 @@ def analyze_sample_rates(drive: Drive) -> dict[tuple[float, bool], LoopAnalysis 
     return analyses
 
 
-def _point(frequency: Any, rate: float) -> Any:
-    """Return the point z on the unit circle for a frequency [Hz]."""
-    return np.exp(2j * math.pi * frequency / rate)
+def _point(frequency: float | np.ndarray, rate: float) -> np.ndarray:
+    """Return the point z on the unit circle for a frequency [Hz], in its shape."""
+    point: np.ndarray = np.exp(2j * math.pi * frequency / rate)
+    return point
 
 
-def _first_below(function: Any, rate: float) -> float:
+def _first_below(function: Callable[[np.ndarray], np.ndarray], rate: float) -> float:
     """Return the first frequency [Hz] at which a function of z becomes negative, or NaN."""
     from scipy.optimize import brentq
 

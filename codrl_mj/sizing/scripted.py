@@ -1,11 +1,11 @@
 """Scripted controllers, which give the demand of a task without training."""
 
 from collections.abc import Callable
-from typing import Any
 
 import gymnasium
 import numpy as np
 
+from codrl_mj.envs.config import Env
 from codrl_mj.tasks import Task
 
 Law = Callable[[np.ndarray], np.ndarray]
@@ -42,12 +42,14 @@ def swing_up_and_balance(states: np.ndarray) -> np.ndarray:
     pump = 0.034 * np.clip(10.0 * missing_energy, -1.0, 1.0) * np.sign(rod_speed * np.cos(rod))
     near_upright = (np.abs(rod) < 0.4) & (np.abs(rod_speed) < 8.0)
     hold = 0.014 * arm - 0.17 * rod + 0.0055 * arm_speed - 0.014 * rod_speed
-    return np.where(near_upright, hold, pump - 0.03 * arm - 0.002 * arm_speed)
+    torques: np.ndarray = np.where(near_upright, hold, pump - 0.03 * arm - 0.002 * arm_speed)
+    return torques
 
 
 def balance(states: np.ndarray) -> np.ndarray:
     """Return forces for CartPole: full force toward the side to which the pole falls."""
-    return np.inf * (states @ np.array([0.1, 0.4, 5.0, 1.5]))
+    forces: np.ndarray = np.inf * (states @ np.array([0.1, 0.4, 5.0, 1.5]))
+    return forces
 
 
 def energy_pumping(task: Task) -> Law:
@@ -57,7 +59,8 @@ def energy_pumping(task: Task) -> Law:
     def law(states: np.ndarray) -> np.ndarray:
         random_direction = generator.choice([-1.0, 1.0], len(states))
         speed = states[:, task.speed_indices[0]]
-        return np.inf * np.where(np.abs(speed) > 1e-6, speed, random_direction)
+        forces: np.ndarray = np.inf * np.where(np.abs(speed) > 1e-6, speed, random_direction)
+        return forces
 
     return law
 
@@ -82,7 +85,7 @@ class Scripted:
         observation: np.ndarray,
         *,
         deterministic: bool = False,  # noqa: ARG002 - required by the Policy protocol
-    ) -> tuple[np.ndarray, Any]:
+    ) -> tuple[np.ndarray, None]:
         """Return actions for states (N, n)."""
         force = np.clip(self._law(observation), -self._task.max_forces[0], self._task.max_forces[0])
         if self._task.forces is None:
@@ -90,6 +93,8 @@ class Scripted:
         return np.abs(np.array(self._task.forces) - force[:, np.newaxis]).argmin(axis=1), None
 
 
-def observe_state(env: Any) -> Any:
+def observe_state(env: Env) -> Env:
     """Wrap an environment so that it observes its mechanical state, in the task's order."""
-    return gymnasium.wrappers.TransformObservation(env, lambda _: env.unwrapped.physics.state, None)
+    return gymnasium.wrappers.TransformObservation(
+        env, lambda _: env.get_wrapper_attr("physics").state, None
+    )

@@ -3,12 +3,12 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import Drive, Supply
-from codrl_mj.sizing.limits import highest_current
+from codrl_mj.sizing.limits import Number, highest_current
 
 _ANGLES = np.linspace(-np.pi, np.pi, 1001)
 _STEP = _ANGLES[1] - _ANGLES[0]
@@ -32,15 +32,18 @@ class Swing(NamedTuple):
     friction: float = 0.0
     """Coulomb friction of the hinge [N*m]."""
 
-    def potential_energy(self, angle: Any) -> Any:
+    def potential_energy(self, angle: Number) -> Number:
         """Return the potential energy [J] at an angle [rad]; 0 when the pendulum hangs."""
-        return self.gravity_torque * (1.0 - np.cos(angle))
+        energy: Number = self.gravity_torque * (1.0 - np.cos(angle))
+        return energy
 
-    def speed(self, kinetic: Any, drive: Drive) -> Any:
+    def speed(self, kinetic: Number, drive: Drive) -> Number:
         """Return the speed [rad/s] at a kinetic energy [J] of pendulum and rotor; 0 if negative."""
-        return np.sqrt(2.0 * np.maximum(kinetic, 0.0) / (self.inertia + drive.additions.armature))
+        inertia = self.inertia + drive.additions.armature
+        speed: Number = np.sqrt(2.0 * np.maximum(kinetic, 0.0) / inertia)
+        return speed
 
-    def max_net_torque(self, speed: Any, drive: Drive) -> Any:
+    def max_net_torque(self, speed: Number, drive: Drive) -> Number:
         """Return the largest net torque [N*m] in the direction of motion.
 
         It is min(tau_max, N eta kT min((V - N kE omega)/R, i_max)) minus friction, where R is the
@@ -55,7 +58,9 @@ class Swing(NamedTuple):
         torque = np.minimum(
             self.max_torque, ratio * motor.torque_constant * motor.gear_efficiency * current
         )
-        return torque - self.friction - added.friction - (self.damping + added.damping) * speed
+        damping = self.damping + added.damping
+        net: Number = torque - self.friction - added.friction - damping * speed
+        return net
 
 
 def min_pumped_energy(swing: Swing, drive: Drive) -> float:

@@ -11,11 +11,13 @@ and tests new policies, in any environment, and applies the same rule (`decide`)
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import IDEAL as IDEAL_ACTUATOR
+from codrl_mj.actuators import ActuatorModel, ActuatorSetting
+from codrl_mj.envs.config import StoredActuators
 from codrl_mj.evaluation import RandomPolicy, evaluate
 from codrl_mj.study.axes import AXES, FLOORS, REAL, SECONDS, generic_arm, ideal_arm, study_env
 from codrl_mj.study.bench import (
@@ -25,7 +27,7 @@ from codrl_mj.study.bench import (
     redesign_loop,
     severities,
 )
-from codrl_mj.study.evidence import Evidence, Loss, Outcome, sum_outcomes
+from codrl_mj.study.evidence import Evidence, Loss, LossBounds, Outcome, sum_outcomes
 from codrl_mj.study.questions import MARGIN, Scores
 from codrl_mj.study.trials import Arm, Grid, StudyResults, Trial
 from codrl_mj.training import TrainConfig, load_config
@@ -38,26 +40,6 @@ RANDOM = ("generic", "random")
 """Arms trained on random actuators: one in each of the two studies, with different ranges."""
 OPTIONS = (IDEAL, COMMAND, LOOP, RANDOMIZE, THROUGH)
 """Options for an actuator, in order of effort. The other two verdicts are `BUY` and `MEASURE`."""
-
-
-class LossBounds(NamedTuple):
-    """Upper and lower bound on the loss of policies with one option."""
-
-    upper: Outcome | None
-    """Largest possible loss; None if unknown."""
-    lower: Outcome | None
-    """Smallest possible loss; None if unknown. Identical to `upper` if tested or interpolated."""
-
-    def summary(self) -> dict[str, Any]:
-        """Return the bounds under the keys of the command line's JSON output."""
-        return {"most": self.upper, "least": self.lower}
-
-    @property
-    def prefix(self) -> str:
-        """Prefix of the loss as text: "at least ", "at most ", or empty if it is exact."""
-        if self.upper is None:
-            return "at least "
-        return "" if self.upper is self.lower else "at most "
 
 
 def decide(options: Mapping[str, LossBounds]) -> str:
@@ -112,13 +94,13 @@ class Advice(NamedTuple):
     reason: str
     """Reason for the verdict, in a sentence."""
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """Return the fields under the keys of the command line's JSON output."""
         names = {"response": "found"}
         return {names.get(name, name): value for name, value in self._asdict().items()}
 
 
-def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
+def advise(actuator: ActuatorModel, task: str, evidence: Evidence) -> Advice:
     """Recommend an option for a force-controlled actuator on a task from the study's results."""
     response = measure_on_task(actuator, task)
     losses = predict_losses(evidence, task, severities(response, task))
@@ -247,7 +229,7 @@ def tested_points(evidence: Evidence, task: str) -> TestedPoints:
                 (
                     name,
                     name,
-                    severities(measure_on_task(study_env(task, real).actuator, task), task),
+                    severities(measure_on_task(study_env(task, real).actuators[0], task), task),
                 )
             )
     return {
@@ -356,7 +338,12 @@ class Measurement(NamedTuple):
 
 
 def plan_measurement(
-    actuator: Any, subject: str, seeds: int, root: Path, episodes: int = 50, trust: bool = False
+    actuator: StoredActuators | ActuatorSetting,
+    subject: str,
+    seeds: int,
+    root: Path,
+    episodes: int = 50,
+    trust: bool = False,
 ) -> Measurement:
     """Plan the trainings and tests that compare all options for an actuator.
 

@@ -8,10 +8,10 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
 
 from codrl_mj.actuators import (
     IDEAL,
+    ActuatorSetting,
     CurrentLoop,
     DCMotorActuator,
     Drive,
@@ -21,6 +21,8 @@ from codrl_mj.actuators import (
     SampledLoop,
     Supply,
 )
+from codrl_mj.actuators.parameters import FieldValue
+from codrl_mj.boundary import Argument
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.trials import Arm, Trial
@@ -61,7 +63,7 @@ REFERENCE_SPEEDS: Mapping[str, float] = {
 """Task -> speed [rad/s or m/s] of the actuated joint at which a motor must still deliver force."""
 
 
-def study_env(task: str, actuator: Any = IDEAL, **fields: Any) -> EnvConfig:
+def study_env(task: str, actuator: ActuatorSetting = IDEAL, **fields: Argument) -> EnvConfig:
     """Return a task's environment for the study, with >= 10 integration steps per policy step.
 
     Ideal and real actuators share the integration step, so that only the actuator differs.
@@ -146,7 +148,7 @@ def noise(task: str, severity: float) -> EnvConfig:
 
 
 _LOOPS = {"weaker": "weaker", "paper": "paper"}
-REAL: Mapping[str, Mapping[str, Any]] = {
+REAL: Mapping[str, Mapping[str, FieldValue]] = {
     "pendulum": {
         "marginal motor": {"name": "quanser-srv02", "motor": {"gear_ratio": 70.0}},
         **_LOOPS,
@@ -240,7 +242,7 @@ AXES: Mapping[str, Axis] = {
 def make_arm(task: str, name: str, env: EnvConfig) -> Arm:
     """Return the arm that trains a task's agent, with default settings, in an environment."""
     agent = "sarsa" if task == "mountain_car" else "ppo"
-    changes: dict[str, Any] = {"total_steps": BUDGETS[task]} if task in BUDGETS else {}
+    changes: dict[str, Argument] = {"total_steps": BUDGETS[task]} if task in BUDGETS else {}
     base = TrainConfig.preset(task, agent, **changes)
     # Evaluations and checkpoints during training would only cost time.
     never = 10**9

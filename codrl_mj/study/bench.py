@@ -1,13 +1,12 @@
 """Bench test of an actuator: one hinge in MuJoCo measures delay, gain and noise as severities."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import DCMotorActuator, Drive, GearMotor, SampledLoop, Supply
+from codrl_mj.actuators import ActuatorModel, DCMotorActuator, Drive, GearMotor, SampledLoop, Supply
 from codrl_mj.engine.specs import add_motors
 from codrl_mj.study.axes import REFERENCE_SPEEDS, noise, timestep
 from codrl_mj.study.grid import check_selection
@@ -19,7 +18,14 @@ HORIZON_STEPS = 20.0
 """Duration of a bench measurement in policy steps; later forces are ignored."""
 
 
-def make_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., np.ndarray]:
+class RunBench(Protocol):
+    """Function that runs the bench of `make_bench`."""
+
+    def __call__(self, torque: float, duration: float, speed: float = 0.0) -> np.ndarray:
+        """Command a torque [N*m] for a `duration` [s], starting at a speed of the joint [rad/s]."""
+
+
+def make_bench(actuator: ActuatorModel, timestep: float, inertia: float) -> RunBench:
     """Build a hinge with an actuator and return a function that runs it.
 
     Args:
@@ -87,7 +93,7 @@ class ActuatorResponse(NamedTuple):
 
 
 def measure_response(
-    actuator: Any, timestep: float, step: float, force: float, speed: float
+    actuator: ActuatorModel, timestep: float, step: float, force: float, speed: float
 ) -> ActuatorResponse:
     """Measure the response of an actuator to a command.
 
@@ -104,7 +110,8 @@ def measure_response(
     unasked = blocked(0.0, duration)[:, 0]
 
     def delivered_torque(joint_speed: float) -> np.ndarray:
-        return (blocked(force, duration, joint_speed)[:, 0] - unasked) / force
+        torques: np.ndarray = blocked(force, duration, joint_speed)[:, 0] - unasked
+        return torques / force
 
     # The inertia is so large that friction hardly slows the hinge within the measurement.
     def braking(joint_speed: float) -> tuple[float, float]:
@@ -145,7 +152,7 @@ def _end(rows: np.ndarray) -> np.ndarray:
 # -- on a task of the study ------------------------------------------------------------------------
 
 
-def measure_on_task(actuator: Any, task: str, share: float = 1.0) -> ActuatorResponse:
+def measure_on_task(actuator: ActuatorModel, task: str, share: float = 1.0) -> ActuatorResponse:
     """Measure the response of an actuator to a `share` of the largest force of a task."""
     check_selection("task", [task], REFERENCE_SPEEDS)
     if actuator.MOTION:
@@ -179,7 +186,8 @@ def severities(response: ActuatorResponse, task: str) -> dict[str, float]:
     else:
         missing = 1.0 - rest / (2.0 * strength)
     noise_severity = (
-        response.noise and response.noise / measure_on_task(noise(task, 1.0).actuator, task).noise
+        response.noise
+        and response.noise / measure_on_task(noise(task, 1.0).actuators[0], task).noise
     )
     return {
         "lag": response.lag,
@@ -192,7 +200,7 @@ def severities(response: ActuatorResponse, task: str) -> dict[str, float]:
 
 
 def measure_with_larger_command(
-    actuator: Any, task: str, response: ActuatorResponse
+    actuator: ActuatorModel, task: str, response: ActuatorResponse
 ) -> ActuatorResponse | None:
     """Return the response to commands that are scaled up to compensate for the force lost at rest.
 
@@ -208,7 +216,7 @@ def measure_with_larger_command(
     return boosted._replace(**shares, **scaled)
 
 
-def redesign_loop(actuator: Any, task: str) -> Drive | None:
+def redesign_loop(actuator: ActuatorModel, task: str) -> Drive | None:
     """Return the motor and supply with a designed loop; None if a new design would not help."""
     if isinstance(actuator, DCMotorActuator):
         # No loop can correct an error of its current sensor.

@@ -67,7 +67,7 @@ class Outcome(NamedTuple):
         """True if the loss certainly exceeds `FAILURE_MARGIN`, or lost success a tenth (95 %)."""
         return self.loss.low > FAILURE_MARGIN or self.success_lost.low > MAX_FAILED_SHARE
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """Return summary statistics as JSON-serializable shares."""
         return {
             "policies": len(self.lost),
@@ -87,6 +87,26 @@ def sum_outcomes(outcomes: Iterable[Outcome]) -> Outcome:
     return Outcome(np.minimum(lost, 1.0), np.minimum(missed, 1.0))
 
 
+class LossBounds(NamedTuple):
+    """Upper and lower bound on the loss of policies with one option."""
+
+    upper: Outcome | None
+    """Largest possible loss; None if unknown."""
+    lower: Outcome | None
+    """Smallest possible loss; None if unknown. Identical to `upper` if tested or interpolated."""
+
+    def summary(self) -> dict[str, object]:
+        """Return the bounds under the keys of the command line's JSON output."""
+        return {"most": self.upper, "least": self.lower}
+
+    @property
+    def prefix(self) -> str:
+        """Prefix of the loss as text: "at least ", "at most ", or empty if it is exact."""
+        if self.upper is None:
+            return "at least "
+        return "" if self.upper is self.lower else "at most "
+
+
 class Loss(NamedTuple):
     """Loss of policies trained on ideal forces at one severity of one axis."""
 
@@ -101,16 +121,21 @@ class Loss(NamedTuple):
     between: tuple[str, ...]
     """Names of the tests between which the loss was interpolated."""
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """Return the fields under the keys of the command line's JSON output."""
         names = {"severity": "dose"}
         return {names.get(name, name): value for name, value in self._asdict().items()}
 
 
+# Scores are numbers in the rows of a study, and texts in its file.
+EvidenceRow = Mapping[str, Any]
+"""Row of a policy in a test: column -> value."""
+
+
 class Evidence:
     """Scores of every policy in every test of the studies."""
 
-    def __init__(self, rows: Iterable[Mapping[str, Any]]) -> None:
+    def __init__(self, rows: Iterable[EvidenceRow]) -> None:
         """Index rows by task, arm and test.
 
         Args:

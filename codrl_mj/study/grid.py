@@ -12,8 +12,9 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypeVar, TypeVarTuple
 
+from codrl_mj.boundary import Argument, Json
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
 from codrl_mj.fields import did_you_mean
@@ -29,6 +30,9 @@ from codrl_mj.training import (
     train,
 )
 
+Cell = TypeVar("Cell")
+"""Name of a cell: a run folder, or the name of a test."""
+Arguments = TypeVarTuple("Arguments")
 _FAILURES, _DEPLOYMENTS = "failures", "deployments"
 # Time [s] to wait for a run folder that a terminating process of a killed grid still locks.
 _LOCK_TIMEOUT = 120.0
@@ -89,7 +93,7 @@ def train_runs(
     runs: Mapping[Path, TrainConfig],
     workers: Workers = Workers(),  # noqa: B008 - frozen
     on_run: Callable[[Path], None] = lambda _: None,
-    **options: Any,
+    **options: Argument,
 ) -> dict[Path, str]:
     """Train every run that is not finished.
 
@@ -133,16 +137,16 @@ def run_tests(
 
 
 def _compute(
-    cells: Iterable[Any],
-    work: Mapping[Any, tuple[Any, ...]],
+    cells: Iterable[Cell],
+    work: Mapping[Cell, tuple[object, ...]],
     workers: Workers,
-    on_cell: Callable[[Any], None],
-) -> dict[Any, str]:
+    on_cell: Callable[[Cell], None],
+) -> dict[Cell, str]:
     """Call `_attempt` for each cell with work; return the errors by cell."""
     for cell in cells:
         if cell not in work:
             on_cell(cell)
-    failures = {}
+    failures: dict[Cell, str] = {}
     for cell, failure in call_in_parallel(
         _attempt, ((cell, *arguments) for cell, arguments in work.items()), workers
     ):
@@ -153,12 +157,12 @@ def _compute(
 
 
 def _attempt(
-    name: Any,
+    name: Cell,
     cell: Path | PolicyTest,
-    context: Mapping[str, Any],
-    function: Callable[..., None],
-    *arguments: Any,
-) -> tuple[Any, str | None]:
+    context: Mapping[str, Json],
+    function: Callable[[*Arguments], None],
+    *arguments: *Arguments,
+) -> tuple[Cell, str | None]:
     """Call a function, and record its error; return the name and the error in one line, or None."""
     record = failure_record(cell)
     try:
@@ -176,7 +180,7 @@ def _attempt(
     return name, None
 
 
-def _train(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> None:
+def _train(config: TrainConfig, folder: Path, options: Mapping[str, Argument]) -> None:
     """Train one run, waiting while another process locks its folder."""
     start = time.monotonic()
     while True:
@@ -198,7 +202,7 @@ def _run_test(test: PolicyTest) -> None:
     write_json(test.record, result.as_mapping())
 
 
-def _digest(content: Any) -> str:
+def _digest(content: Json) -> str:
     """Return a short digest of JSON-serializable content."""
     text = json.dumps(content, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -4,8 +4,8 @@ import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
+from codrl_mj.boundary import Artist, Figure
 from codrl_mj.runs.files import atomic_write
 
 COLORS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9")
@@ -59,7 +59,7 @@ def markdown_table(
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
     """Write a CSV table atomically.
 
     Args:
@@ -68,7 +68,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             empty.
     """
 
-    def to_cell(value: Any) -> Any:
+    def to_cell(value: object) -> object:
         return "" if value is None or (isinstance(value, float) and math.isnan(value)) else value
 
     with atomic_write(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
@@ -85,9 +85,9 @@ def read_csv(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def add_legend(figure: Any, columns: int) -> None:
+def add_legend(figure: Figure, columns: int) -> None:
     """Add one legend below all panels of a figure, with each label once."""
-    entries: dict[str, Any] = {}
+    entries: dict[str, Artist] = {}
     for axes in figure.axes:
         entries |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     figure.legend(
@@ -99,7 +99,7 @@ def add_legend(figure: Any, columns: int) -> None:
     )
 
 
-def save_figure(figure: Any, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure as SVG on white; the file is byte-identical for the same figure."""
     import matplotlib
 

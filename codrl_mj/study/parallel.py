@@ -9,11 +9,14 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Literal
+from typing import Literal, TypeVar
 
 from codrl_mj.fields import Checked, choice
 from codrl_mj.training import TrainingStoppedError
 from codrl_mj.training.run import collecting_signals
+
+Result = TypeVar("Result")
+"""Result of a call."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,8 +53,8 @@ class Workers(Checked):
 
 
 def call_in_parallel(
-    function: Callable[..., Any], work: Iterable[tuple[Any, ...]], workers: Workers
-) -> Iterator[Any]:
+    function: Callable[..., Result], work: Iterable[tuple[object, ...]], workers: Workers
+) -> Iterator[Result]:
     """Yield the results of calls as they complete; with Ray, after all of them have finished.
 
     After Ctrl-C no further call starts, trainings stop at a checkpoint, and other calls run to
@@ -103,8 +106,8 @@ def call_in_parallel(
 
 
 def _call(
-    function: Callable[..., Any], arguments: tuple[Any, ...], parent: int | None
-) -> tuple[Any, int | None]:
+    function: Callable[..., Result], arguments: tuple[object, ...], parent: int | None
+) -> tuple[Result | None, int | None]:
     """Call a function; return its result and the signal that stopped it, if any."""
     if parent is not None and os.getpid() != parent:
         _die_with_parent(parent)

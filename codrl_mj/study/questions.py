@@ -6,7 +6,7 @@ scores.
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -179,7 +179,7 @@ class Verdict(NamedTuple):
             else None
         )
 
-    def row(self, questions: int) -> dict[str, Any]:
+    def row(self, questions: int) -> dict[str, object]:
         """Return the row of the file of verdicts; `questions` as in `seeds_to_close`."""
         question = self.question
         return {

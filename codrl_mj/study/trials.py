@@ -11,19 +11,20 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import mapping_of
+from codrl_mj.boundary import Json
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.measures import bootstrap_mean
+from codrl_mj.runs import RESULT
 from codrl_mj.runs.files import read_json
 from codrl_mj.study.grid import PolicyTest, cell_folder, read_failure, run_tests, train_runs
 from codrl_mj.study.pages import read_csv
 from codrl_mj.study.parallel import Workers
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, finished
-from codrl_mj.training.folder import RESULT
 
 TEST_SECONDS = 1.0
 """Approximate time of a test [s of one core]."""
@@ -272,7 +273,7 @@ class Grid:
             for trial, seed in self.published_rows
             if (cell := (arm_of[trial], seed))
         }
-        evaluations: dict[str, dict[int, Mapping[str, Any]]] = {
+        evaluations: dict[str, dict[int, Mapping[str, Json]]] = {
             trial.name: {} for trial in self.trials
         }
         missing: dict[str, Path | PolicyTest] = {
@@ -376,7 +377,7 @@ class StudyResults:
     """Grid of the results."""
     folders: Mapping[tuple[str, int], Path]
     """Run folders of the finished trainings, by arm and seed."""
-    evaluations: Mapping[str, Mapping[int, Mapping[str, Any]]]
+    evaluations: Mapping[str, Mapping[int, Mapping[str, Json]]]
     """`Evaluation.as_mapping()` by trial and seed, without missing ones."""
     missing: tuple[str, ...]
     """Names of unfinished trainings, and of missing tests of finished ones."""
@@ -397,7 +398,7 @@ class StudyResults:
 
 def run_rows(
     collected: StudyResults, score: Callable[[Trial], Mapping[int, float]]
-) -> Iterable[dict[str, Any]]:
+) -> Iterable[dict[str, object]]:
     """Yield a row for every policy and test; `score` returns a trial's scores by seed.
 
     The units are those of docs/evaluation.md.
@@ -419,7 +420,7 @@ def run_rows(
 
 def trial_rows(
     collected: StudyResults, score: Callable[[Trial], Mapping[int, float]]
-) -> Iterable[dict[str, Any]]:
+) -> Iterable[dict[str, object]]:
     """Yield a row for every trial: mean score with bootstrap interval, means of the measures."""
     for trial in collected.grid.trials:
         scores = np.array(list(score(trial).values()))
@@ -454,7 +455,7 @@ def cell_name(name: str, seed: int) -> str:
     return f"{name}, seed {seed}"
 
 
-def to_scalar(value: Any) -> Any:
+def to_scalar(value: Json) -> Json:
     """Return a measure as a number: the mean of an interval, or the median of quartiles."""
     return value.get("mean", value.get("median")) if isinstance(value, Mapping) else value
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from codrl_mj.actuators import check_same_family, resolve
+from codrl_mj.actuators import ActuatorModel, ActuatorSetting, check_same_family, resolve
 from codrl_mj.tasks import (
     acrobot,
     cartpole,
@@ -24,7 +24,9 @@ PAPER_TASKS = tuple(
 add_task(furuta.TASK)
 
 
-def resolve_actuators(actuator: Any, task: Task) -> tuple[Any, ...]:
+def resolve_actuators(
+    actuator: ActuatorSetting | list[ActuatorSetting] | tuple[ActuatorSetting, ...], task: Task
+) -> tuple[ActuatorModel, ...]:
     """Return an actuator for each of a task's motors.
 
     Args:
@@ -59,7 +61,12 @@ def resolve_actuators(actuator: Any, task: Task) -> tuple[Any, ...]:
     return actuators
 
 
-def named_actuator(name: str, task: str) -> Any:
+# The name determines the family of the actuator, and the task whether there are several.
+NamedActuator = Any
+"""An `ActuatorModel`, or a tuple of them."""
+
+
+def named_actuator(name: str, task: str) -> NamedActuator:
     """Return the actuator of a name on a task; a tuple if the task has several motors.
 
     Args:

@@ -45,7 +45,6 @@ motor an environment step has ten integration steps, as in the paper.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -53,7 +52,7 @@ from gymnasium.envs.classic_control import utils
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.tasks.attributes import Fixed, ModelNumber, Setting, center_of_mass, mass
-from codrl_mj.tasks.base import Entries, Task
+from codrl_mj.tasks.base import Entries, Flags, NoOptions, ResetOptions, Task, Values
 from codrl_mj.tasks.reference_env import GymnasiumReferenceEnv, ReferenceStates, values_around
 
 # Constants of Gymnasium's Acrobot-v1.
@@ -63,29 +62,29 @@ MAX_SPEED_2 = 9 * math.pi  # rad/s
 GOAL_HEIGHT = 1.0  # m above the shoulder
 
 
-def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
+def initial_bounds(options: ResetOptions | None) -> tuple[np.ndarray, np.ndarray]:
     """Return -0.1 and 0.1 for all four entries, or the reset options' `low` and `high`."""
     low, high = utils.maybe_parse_reset_bounds(options, -0.1, 0.1)
     return np.full(4, low), np.full(4, high)
 
 
-def initial_state(draws: Entries) -> tuple[Any, ...]:
+def initial_state(draws: Entries) -> tuple[Values, ...]:
     """Return the draws rounded to float32, as Gymnasium does."""
     return _rounded(draws[0]), _rounded(draws[1]), _rounded(draws[2]), _rounded(draws[3])
 
 
-def _rounded(number: Any) -> Any:
+def _rounded(number: Values) -> Values:
     return np.float64(np.float32(number))
 
 
-def constrain(state: Entries, timestep: float) -> tuple[Any, ...]:
+def constrain(state: Entries, timestep: float) -> tuple[Values, ...]:
     """Wrap the angles and limit the speeds."""
     speed_1 = np.minimum(np.maximum(state[2], -MAX_SPEED_1), MAX_SPEED_1)
     speed_2 = np.minimum(np.maximum(state[3], -MAX_SPEED_2), MAX_SPEED_2)
     return _wrapped(state[0]), _wrapped(state[1]), speed_1, speed_2
 
 
-def _wrapped(angle: Any) -> Any:
+def _wrapped(angle: Values) -> Values:
     """Return an angle, wrapped to [-pi, pi] by whole turns."""
     # A modulo would round angles that are within the range already, and Gymnasium does not.
     turn = 2 * math.pi
@@ -93,7 +92,7 @@ def _wrapped(angle: Any) -> Any:
     return angle + turn * np.maximum(np.ceil((-math.pi - angle) / turn), 0.0)
 
 
-def observation(state: Entries) -> tuple[Any, ...]:
+def observation(state: Entries) -> tuple[Values, ...]:
     """Return the cosines and sines of the angles, and the speeds."""
     return (
         np.cos(state[0]),
@@ -105,12 +104,13 @@ def observation(state: Entries) -> tuple[Any, ...]:
     )
 
 
-def terminated(state: Entries) -> Any:
+def terminated(state: Entries) -> Flags:
     """Return True if the tip is above the goal line."""
-    return -np.cos(state[0]) - np.cos(state[1] + state[0]) > GOAL_HEIGHT
+    is_above: Flags = -np.cos(state[0]) - np.cos(state[1] + state[0]) > GOAL_HEIGHT
+    return is_above
 
 
-def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
+def reward(state: Entries, force: Values, next_state: Entries, options: NoOptions) -> Values:
     """Return -1, or 0 for the step that reaches the goal."""
     return -1.0 + terminated(next_state)
 

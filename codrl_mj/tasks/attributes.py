@@ -2,7 +2,7 @@
 
 import enum
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 COMPILED = (
     "it is compiled into the task's functions: use a `gymnasium.Wrapper` for other limits or ends"
@@ -29,10 +29,10 @@ class ModelNumber(NamedTuple):
 
 
 class Fixed(NamedTuple):
-    """Number that cannot be written."""
+    """Number or word that cannot be written."""
 
-    value: Any
-    """The number."""
+    value: float | str
+    """The number or the word."""
     remedy: str = COMPILED
     """Instruction on what to do instead of writing the number."""
 

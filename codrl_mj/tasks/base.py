@@ -4,7 +4,7 @@ import functools
 import math
 import numbers
 from collections import UserDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from codrl_mj import fields
 from codrl_mj.actuators import ActuatorModel, DCMotorActuator, Ideal
 from codrl_mj.tasks.attributes import Attribute
 from codrl_mj.tasks.checks import check_fields, check_functions, check_layout
-from codrl_mj.tasks.reference_env import ReferenceEnv, ReferenceStates
+from codrl_mj.tasks.reference_env import Force, ReferenceEnv, ReferenceStates
 from codrl_mj.user_code import asset_path
 
 
@@ -24,10 +24,19 @@ class NoOptions(NamedTuple):
     """Options of a task without options."""
 
 
+# Each task declares its own options, and only its own functions read them.
 Options = Any
 """Type of a task's options: a `NamedTuple` of floats and flags whose fields have defaults."""
-Entries = Any
+Values = float | np.ndarray
+"""A number, or an array with a number for each state."""
+Flags = bool | np.ndarray
+"""True or False, or an array of them with one for each state."""
+Entries = np.ndarray | Sequence[Values]
 """Type of a state's entries: a sequence of numbers, or of arrays with a number for each state."""
+# Gymnasium accepts any values, and each task converts and checks those that it reads.
+ResetOption = Any
+ResetOptions = dict[str, ResetOption]
+"""Argument `options` of `reset`."""
 INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
     "semi-implicit": mujoco.mjtIntegrator.mjINT_EULER,
@@ -68,7 +77,7 @@ class Task(fields.Checked):
     """Duration of one environment step [s]."""
     motor_inner_steps: int = field(metadata=fields.integer(1, minimum=1).metadata)
     """Integration steps per environment step when a motor is in the loop."""
-    max_force: Any
+    max_force: Force
     """Largest desired force [N] or torque [N*m] of any action. If the action is the force, it is
     clipped to this. A number for all motors, or one for each.
     """
@@ -80,27 +89,27 @@ class Task(fields.Checked):
     """Names of the state's entries, with units."""
     observation_names: tuple[str, ...]
     """Names of the observation's entries."""
-    initial_bounds: Callable[[dict[str, Any] | None], tuple[np.ndarray, np.ndarray]]
+    initial_bounds: Callable[[ResetOptions | None], tuple[np.ndarray, np.ndarray]]
     """Function (reset options) -> lower and upper bounds of the k numbers drawn at a reset.
 
     Each has shape (k,). Tasks of Gymnasium draw the same numbers as Gymnasium.
     """
-    initial_state: Callable[[Entries], tuple[Any, ...]]
+    initial_state: Callable[[Entries], tuple[Values, ...]]
     """Function (k numbers drawn uniformly within the bounds) -> entries of the initial state."""
-    observation: Callable[[Entries], tuple[Any, ...]]
+    observation: Callable[[Entries], tuple[Values, ...]]
     """Function (state) -> entries of the observation, which are then rounded to float32."""
-    reward: Callable[[Entries, Any, Entries, Options], Any]
+    reward: Callable[[Entries, Force, Entries, Options], Values]
     """Function (state before, force delivered, state after, options) -> reward."""
-    terminated: Callable[[Entries], Any]
+    terminated: Callable[[Entries], Flags]
     """Function (state) -> True if the episode terminates in it."""
-    constrain: Callable[[Entries, float], tuple[Any, ...]] | None = None
+    constrain: Callable[[Entries, float], tuple[Values, ...]] | None = None
     """Function (integrated state, integration step [s]) -> entries of the state within its bounds.
 
     The bounds are those of Gymnasium's `step`: speed limits, walls, wrapped angles. They are
     applied after every integration step. The function must propagate NaN. None if there are no
     bounds.
     """
-    goal: Callable[[Entries], Any] | None = None
+    goal: Callable[[Entries], Flags] | None = None
     """Function (state) -> True if the state is at the task's goal.
 
     An episode succeeds if it ends at the goal and has been there for `goal_hold`. None if the goal
@@ -109,11 +118,11 @@ class Task(fields.Checked):
     goal_hold: float = fields.real(0.0, minimum=0.0, unit="s")
     """Time [s] at the goal, up to the end of the episode, that success requires."""
 
-    forces: tuple[Any, ...] | None = None
+    forces: tuple[Force, ...] | None = None
     """Desired forces [N] or torques [N*m] of the discrete actions, in order; None if the action is
     the force. Each is a number, or a tuple if there are several motors.
     """
-    options: type[Any] = NoOptions
+    options: type[Options] = NoOptions
     """Class of the task's options: a `NamedTuple` whose fields all have defaults."""
     qpos: tuple[int, ...] = ()
     """Indices of the state entries that are MuJoCo's `qpos`, in order; by default the state's first
@@ -121,7 +130,7 @@ class Task(fields.Checked):
     """
     qvel: tuple[int, ...] = ()
     """Indices of the state entries that are MuJoCo's `qvel`; by default the second half."""
-    action_space: spaces.Space[Any] = None  # type: ignore[assignment]
+    action_space: spaces.Box | spaces.Discrete = None  # type: ignore[assignment]
     """Action space, as in Gymnasium; by default forces up to `max_force` or indices of `forces`.
 
     A copy of the task with another `max_force` keeps the space, as Gymnasium's Pendulum does when
@@ -299,7 +308,7 @@ class Task(fields.Checked):
             )
         return tuple(units)
 
-    def bounds(self, options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
+    def bounds(self, options: ResetOptions | None) -> tuple[np.ndarray, np.ndarray]:
         """Return `initial_bounds` with a reset's options.
 
         Raises:
@@ -321,7 +330,7 @@ class Task(fields.Checked):
         return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
 
     def draw_initial_state(
-        self, generator: np.random.Generator, options: dict[str, Any] | None
+        self, generator: np.random.Generator, options: ResetOptions | None
     ) -> np.ndarray:
         """Draw an initial state, shape (n,), the same as Gymnasium's with the same generator."""
         low, high = self.bounds(options)
@@ -336,16 +345,16 @@ class Task(fields.Checked):
         return states
 
 
-class _RecordingOptions(UserDict[str, Any]):
+class _RecordingOptions(UserDict[str, ResetOption]):
     """Reset options that record the names that were looked up."""
 
-    def __init__(self, options: Mapping[str, Any]) -> None:
-        self.names: set[Any] = set()
+    def __init__(self, options: Mapping[str, ResetOption]) -> None:
+        self.names: set[object] = set()
         super().__init__(options)
 
     def __contains__(self, name: object) -> bool:
         self.names.add(name)
         return super().__contains__(name)
 
-    def __getitem__(self, name: str) -> Any:
+    def __getitem__(self, name: str) -> ResetOption:
         return self.data[name] if name in self else super().__getitem__(name)

@@ -44,7 +44,7 @@ by default, 0.1 in the paper's training; and Gymnasium's `sutton_barto_reward`. 
 
 import math
 import operator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -52,7 +52,7 @@ from gymnasium.envs.classic_control import utils
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.tasks.attributes import GRAVITY, Derived, Fixed, Setting, center_of_mass, mass
-from codrl_mj.tasks.base import Entries, Task
+from codrl_mj.tasks.base import Entries, Flags, ResetOptions, Task, Values
 from codrl_mj.tasks.reference_env import GymnasiumReferenceEnv, ReferenceStates, values_around
 
 # Constants of Gymnasium's CartPole-v1.
@@ -70,33 +70,34 @@ class Options(NamedTuple):
     """Gymnasium's option: -1 for the terminating step and 0 for all others, instead of 1."""
 
 
-def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
+def initial_bounds(options: ResetOptions | None) -> tuple[np.ndarray, np.ndarray]:
     """Return -0.05 and 0.05 for all four entries, or the reset options' `low` and `high`."""
     low, high = utils.maybe_parse_reset_bounds(options, -0.05, 0.05)
     return np.full(4, low), np.full(4, high)
 
 
-def initial_state(draws: Entries) -> tuple[Any, ...]:
+def initial_state(draws: Entries) -> tuple[Values, ...]:
     """Return the draws as the state."""
     return draws[0], draws[1], draws[2], draws[3]
 
 
-def observation(state: Entries) -> tuple[Any, ...]:
+def observation(state: Entries) -> tuple[Values, ...]:
     """Return the state."""
     return state[0], state[1], state[2], state[3]
 
 
-def terminated(state: Entries) -> Any:
+def terminated(state: Entries) -> Flags:
     """Return True if the cart is off the track or the pole leans by more than 12 degrees."""
-    return (np.abs(state[0]) > X_LIMIT) | (np.abs(state[2]) > ANGLE_LIMIT)
+    is_out: Flags = (np.abs(state[0]) > X_LIMIT) | (np.abs(state[2]) > ANGLE_LIMIT)
+    return is_out
 
 
-def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
+def reward(state: Entries, force: Values, next_state: Entries, options: Options) -> Values:
     """Return 1, or 0 outside `center_radius`.
 
     With `sutton_barto_reward`, return -1 for the terminating step and outside the radius, else 0.
     """
-    outside = np.abs(next_state[0]) > options.center_radius
+    outside: Flags = np.abs(next_state[0]) > options.center_radius
     if options.sutton_barto_reward:
         return 0.0 - (terminated(next_state) | outside)
     return 1.0 - outside

@@ -12,11 +12,15 @@ from gymnasium import spaces
 
 from codrl_mj.user_code import call, check_form, source_location
 
+# Users declare the fields of a task: these checks find the values that are not of the declared
+# type.
+UncheckedTask = Any
+"""Task whose fields may have values of any type."""
 _TEXTS = ("name", "env_id", "asset", "actuator", "agent")
 _NAMES = ("state_names", "observation_names", "motors", "integrators")
 
 
-def check_fields(task: Any) -> None:
+def check_fields(task: UncheckedTask) -> None:
     """Raise an error if a field has a wrong type or value."""
     for name in _TEXTS:
         _require(task, name, isinstance(getattr(task, name), str | Path), "a string")
@@ -56,7 +60,7 @@ def check_fields(task: Any) -> None:
     _require(task, "forces", is_valid, f"{requirement}, within max_force = {task.max_force}")
 
 
-def check_layout(task: Any) -> None:
+def check_layout(task: UncheckedTask) -> None:
     """Raise an error if indices or spaces do not fit the names."""
     states, parts, box = len(task.state_names), (task.qpos, task.qvel), task.observation_space
     is_valid = all(isinstance(index, int) for part in parts for index in part) and sorted(
@@ -87,7 +91,9 @@ def check_layout(task: Any) -> None:
         lengths in (None, {states}),
         f"ReferenceStates with {states} entries in each of bounds, edges and start",
     )
-    expected: Any = spaces.Box(-np.inf, np.inf, (len(task.observation_names),), np.float32)
+    expected: spaces.Box | spaces.Discrete = spaces.Box(
+        -np.inf, np.inf, (len(task.observation_names),), np.float32
+    )
     is_valid = isinstance(box, spaces.Box) and (box.shape, box.dtype) == (
         expected.shape,
         expected.dtype,
@@ -114,7 +120,7 @@ def check_layout(task: Any) -> None:
     )
 
 
-def check_functions(task: Any) -> None:
+def check_functions(task: UncheckedTask) -> None:
     """Call each function on plain numbers, and compare its result with the declaration."""
     bounds = call("Task.initial_bounds", task.initial_bounds, None)
     is_valid = (
@@ -162,10 +168,10 @@ def check_functions(task: Any) -> None:
             ) from error
 
 
-def _call_function(task: Any, name: str, names: str, *arguments: Any) -> Any:
+def _call_function(task: UncheckedTask, name: str, names: str, *arguments: object) -> object:
     """Return a function's result: a finite number for each of the task's names, or a single one."""
     function, form = getattr(task, name), getattr(task, names) if names else ""
-    value = check_form(
+    value: object = check_form(
         function, call(f"Task.{name}", function, *arguments), form, f"Task.{names or name}"
     )
     array = np.array(value, dtype=np.float64)
@@ -178,7 +184,7 @@ def _call_function(task: Any, name: str, names: str, *arguments: Any) -> Any:
     return value
 
 
-def _are_numbers(value: Any, *shapes: tuple[int, ...]) -> bool:
+def _are_numbers(value: object, *shapes: tuple[int, ...]) -> bool:
     """Return True if a value consists of finite numbers and has one of some shapes."""
     try:
         array = np.asarray(value)
@@ -188,6 +194,6 @@ def _are_numbers(value: Any, *shapes: tuple[int, ...]) -> bool:
     return array.dtype.kind in "iuf" and array.shape in shapes and bool(np.isfinite(array).all())
 
 
-def _require(task: Any, name: str, is_valid: Any, requirement: str) -> None:
+def _require(task: UncheckedTask, name: str, is_valid: object, requirement: str) -> None:
     if not is_valid:
         raise ValueError(f"Task.{name} = {getattr(task, name)!r}: must be {requirement}")

@@ -84,14 +84,13 @@ encoder's cable does not pull.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
 from codrl_mj.tasks.attributes import GRAVITY, Fixed, Setting, center_of_mass, mass
-from codrl_mj.tasks.base import Entries, Task
+from codrl_mj.tasks.base import Entries, Flags, NoOptions, ResetOptions, Task, Values
 from codrl_mj.tasks.reference_env import ReferenceStates, values_around
 
 MAX_TORQUE = 0.084  # N*m: 2 A, the amplifier's peak current, times kT = 0.042 N*m/A
@@ -100,18 +99,18 @@ GOAL_ANGLE = 0.1  # rad
 GOAL_HOLD = 1.0  # s
 
 
-def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
+def initial_bounds(options: ResetOptions | None) -> tuple[np.ndarray, np.ndarray]:
     """Return -0.05 and 0.05 about hanging at rest, or the reset options' `low` and `high`."""
     low, high = utils.maybe_parse_reset_bounds(options, -0.05, 0.05)
     return np.full(4, low), np.full(4, high)
 
 
-def initial_state(draws: Entries) -> tuple[Any, ...]:
+def initial_state(draws: Entries) -> tuple[Values, ...]:
     """Return the draws as the state; the rod's angle is drawn relative to hanging."""
     return draws[0], draws[1] + math.pi, draws[2], draws[3]
 
 
-def observation(state: Entries) -> tuple[Any, ...]:
+def observation(state: Entries) -> tuple[Values, ...]:
     """Return the cosines and sines of the angles, and the speeds."""
     return (
         np.cos(state[0]),
@@ -123,17 +122,19 @@ def observation(state: Entries) -> tuple[Any, ...]:
     )
 
 
-def terminated(state: Entries) -> Any:
+def terminated(state: Entries) -> Flags:
     """Return True if the arm is beyond its limit."""
-    return np.abs(state[0]) > ARM_LIMIT
+    is_beyond: Flags = np.abs(state[0]) > ARM_LIMIT
+    return is_beyond
 
 
-def goal(state: Entries) -> Any:
+def goal(state: Entries) -> Flags:
     """Return True if the rod is upright."""
-    return np.cos(state[1]) > math.cos(GOAL_ANGLE)
+    is_upright: Flags = np.cos(state[1]) > math.cos(GOAL_ANGLE)
+    return is_upright
 
 
-def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
+def reward(state: Entries, force: Values, next_state: Entries, options: NoOptions) -> Values:
     """Return the rod's height, reduced by shares for the arm's angle and for the torque."""
     deviation, share = next_state[0] / ARM_LIMIT, force / MAX_TORQUE
     return (
@@ -203,7 +204,8 @@ class ReferenceEnv:
             second = self.derivative(state + timestep / 2 * first, force)
             third = self.derivative(state + timestep / 2 * second, force)
             fourth = self.derivative(state + timestep * third, force)
-        return state + timestep / 6 * (first + 2 * second + 2 * third + fourth)
+        after: np.ndarray = state + timestep / 6 * (first + 2 * second + 2 * third + fourth)
+        return after
 
 
 _HIGH = np.array([1.0, 1.0, 1.0, 1.0, np.inf, np.inf], dtype=np.float32)

@@ -37,15 +37,13 @@ is semi-implicit Euler, as in Gymnasium. With a motor an environment step has tw
 steps, as in the paper.
 """
 
-from typing import Any
-
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.tasks.attributes import Attribute, Fixed, ModelNumber, mass
-from codrl_mj.tasks.base import Entries, Task
+from codrl_mj.tasks.base import Entries, Flags, NoOptions, ResetOptions, Task, Values
 from codrl_mj.tasks.reference_env import (
     GymnasiumReferenceEnv,
     ReferenceStates,
@@ -60,18 +58,18 @@ MAX_SPEED = 0.07  # m/s
 GOAL = 0.5  # m
 
 
-def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
+def initial_bounds(options: ResetOptions | None) -> tuple[np.ndarray, np.ndarray]:
     """Return -0.6 and -0.4 for the position, or the reset options' `low` and `high`."""
     low, high = utils.maybe_parse_reset_bounds(options, -0.6, -0.4)
     return np.array([low]), np.array([high])
 
 
-def initial_state(draws: Entries) -> tuple[Any, ...]:
+def initial_state(draws: Entries) -> tuple[Values, ...]:
     """Return the drawn position, at rest."""
     return draws[0], 0.0 * draws[0]
 
 
-def constrain(state: Entries, timestep: float) -> tuple[Any, ...]:
+def constrain(state: Entries, timestep: float) -> tuple[Values, ...]:
     """Limit the speed and the position; stop the car at the left wall."""
     # Gymnasium limits the speed before it moves the car, so the position is corrected.
     speed = np.minimum(np.maximum(state[1], -MAX_SPEED), MAX_SPEED)
@@ -80,17 +78,17 @@ def constrain(state: Entries, timestep: float) -> tuple[Any, ...]:
     return np.minimum(np.maximum(position, MIN_POSITION), MAX_POSITION), speed
 
 
-def observation(state: Entries) -> tuple[Any, ...]:
+def observation(state: Entries) -> tuple[Values, ...]:
     """Return the state."""
     return state[0], state[1]
 
 
-def terminated(state: Entries) -> Any:
+def terminated(state: Entries) -> Flags:
     """Return True if the car is at the flag or beyond, and not rolling back."""
     return (state[0] >= GOAL) & (state[1] >= 0.0)
 
 
-def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
+def reward(state: Entries, force: Values, next_state: Entries, options: NoOptions) -> Values:
     """Return -1 for every step."""
     return -1.0
 

@@ -39,7 +39,6 @@ integration is the same as in MountainCar.
 
 import dataclasses
 import functools
-from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -47,19 +46,19 @@ from gymnasium import spaces
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.tasks import mountain_car
 from codrl_mj.tasks.attributes import Fixed
-from codrl_mj.tasks.base import Entries
+from codrl_mj.tasks.base import Entries, Flags, NoOptions, Values
 
 # Constants of Gymnasium's MountainCarContinuous-v0.
 FORCE = 1.0  # N
 GOAL = 0.45  # m
 
 
-def terminated(state: Entries) -> Any:
+def terminated(state: Entries) -> Flags:
     """Return True if the car is at the flag or beyond, and not rolling back."""
     return (state[0] >= GOAL) & (state[1] >= 0.0)
 
 
-def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
+def reward(state: Entries, force: Values, next_state: Entries, options: NoOptions) -> Values:
     """Return 100 at the goal, minus 0.1 times the square of the delivered force."""
     return 100.0 * terminated(next_state) - 0.1 * (force * force)
 

@@ -42,7 +42,6 @@ The integrator is semi-implicit Euler, as in the installed Gymnasium (the paper 
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -50,7 +49,7 @@ from gymnasium.envs.classic_control import utils
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.tasks.attributes import GRAVITY, Fixed, Setting, center_of_mass, mass
-from codrl_mj.tasks.base import Entries, Task
+from codrl_mj.tasks.base import Entries, Flags, NoOptions, ResetOptions, Task, Values
 from codrl_mj.tasks.reference_env import GymnasiumReferenceEnv, ReferenceStates, values_around
 
 # Constants of Gymnasium's Pendulum-v1.
@@ -62,7 +61,7 @@ GOAL_SPEED = 0.1  # rad/s
 GOAL_HOLD = 1.0  # s
 
 
-def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
+def initial_bounds(options: ResetOptions | None) -> tuple[np.ndarray, np.ndarray]:
     """Return +-pi and +-1 for angle and speed, or the reset options' `x_init` and `y_init`."""
     values = options or {}
     high = np.array(
@@ -74,39 +73,41 @@ def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarr
     return -high, high
 
 
-def initial_state(draws: Entries) -> tuple[Any, ...]:
+def initial_state(draws: Entries) -> tuple[Values, ...]:
     """Return the draws as the state."""
     return draws[0], draws[1]
 
 
-def constrain(state: Entries, timestep: float) -> tuple[Any, ...]:
+def constrain(state: Entries, timestep: float) -> tuple[Values, ...]:
     """Limit the speed, and correct the angle as if the limited speed had moved it."""
     # minimum and maximum in this order pass NaN on.
     speed = np.minimum(np.maximum(state[1], -MAX_SPEED), MAX_SPEED)
     return state[0] - (state[1] - speed) * timestep, speed
 
 
-def observation(state: Entries) -> tuple[Any, ...]:
+def observation(state: Entries) -> tuple[Values, ...]:
     """Return cos(theta), sin(theta) and theta_dot."""
     return np.cos(state[0]), np.sin(state[0]), state[1]
 
 
-def terminated(state: Entries) -> Any:
+def terminated(state: Entries) -> Flags:
     """Return False: an episode ends only by its time limit."""
     return False
 
 
-def upright_angle(state: Entries) -> Any:
+def upright_angle(state: Entries) -> Values:
     """Return the rod's angle from upright [rad], wrapped to [-pi, pi)."""
     return (state[0] + np.pi) % (2 * np.pi) - np.pi
 
 
-def goal(state: Entries) -> Any:
+def goal(state: Entries) -> Flags:
     """Return True if the rod is upright and still."""
-    return (np.abs(upright_angle(state)) < GOAL_ANGLE) & (np.abs(state[1]) < GOAL_SPEED)
+    is_upright: Flags = np.abs(upright_angle(state)) < GOAL_ANGLE
+    is_still: Flags = np.abs(state[1]) < GOAL_SPEED
+    return is_upright & is_still
 
 
-def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
+def reward(state: Entries, force: Values, next_state: Entries, options: NoOptions) -> Values:
     """Return the negated cost of angle and speed before the step, and of the torque delivered."""
     angle, speed = upright_angle(state), state[1]
     return -(angle * angle + 0.1 * (speed * speed) + 0.001 * (force * force))

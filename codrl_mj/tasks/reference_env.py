@@ -9,6 +9,14 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+# A number in a task with one motor, else a tuple or an array with a number for each motor. A
+# function of one task takes either the one or the other.
+Force = Any
+"""Force [N] or torque [N*m] on the actuated joints."""
+# Each of Gymnasium's environments has attributes of its own.
+GymnasiumEnv = Any
+"""Environment of Gymnasium without its wrappers."""
+
 
 class ReferenceEnv(Protocol):
     """Independent implementation of a task's dynamics, driven one integration step at a time.
@@ -20,7 +28,7 @@ class ReferenceEnv(Protocol):
     """
 
     def __call__(
-        self, state: np.ndarray, force: Any, timestep: float, integrator: str
+        self, state: np.ndarray, force: Force, timestep: float, integrator: str
     ) -> np.ndarray:
         """Return the state one integration step later.
 
@@ -45,7 +53,12 @@ class GymnasiumReferenceEnv:
         """Create the environment."""
         self.env = make_gymnasium_env(self.env_id)
 
-    def state_after(self, state: Any, action: Any, **attributes: Any) -> Any:
+    def state_after(
+        self,
+        state: np.ndarray | tuple[float, ...],
+        action: int | np.ndarray,
+        **attributes: object,
+    ) -> np.ndarray:
         """Return the state after one `step` from a state, with attributes set during the step."""
         previous = {name: getattr(self.env, name) for name in attributes}
         try:
@@ -56,10 +69,11 @@ class GymnasiumReferenceEnv:
         finally:
             for name, value in previous.items():
                 setattr(self.env, name, value)
-        return self.env.state
+        after: np.ndarray = self.env.state
+        return after
 
 
-def make_gymnasium_env(env_id: str) -> Any:
+def make_gymnasium_env(env_id: str) -> GymnasiumEnv:
     """Create a Gymnasium environment without its wrappers."""
     import gymnasium
 

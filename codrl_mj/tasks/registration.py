@@ -2,13 +2,21 @@
 
 import itertools
 import sys
-from typing import Any
+from typing import Protocol
 
 from codrl_mj.tasks.base import Task
 from codrl_mj.user_code import look_up
 
 TASKS: dict[str, Task] = {}
 """Registered tasks by their names on the command line."""
+
+
+class Registered(Protocol):
+    """Task or env source, which other processes find by its name."""
+
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
 
 
 def add_task(task: Task) -> Task:
@@ -28,7 +36,7 @@ def add_task(task: Task) -> Task:
     return task
 
 
-def reference_of(task: Any, home: str | None = None) -> str:
+def reference_of(task: Registered, home: str | None = None) -> str:
     """Return a name under which any process can find a task or env source.
 
     This is the name of a built-in task, or `module:NAME` of a custom one. For a custom task that is
@@ -40,7 +48,8 @@ def reference_of(task: Any, home: str | None = None) -> str:
     """
     # If several modules have the task, its home is preferred; the script, which other processes
     # cannot import by its name, is the last choice.
-    home, script = home or task.reward.__module__, "__main__"
+    functions = getattr(task, "reward", task)
+    home, script = home or str(functions.__module__), "__main__"
     others = (module for module in list(sys.modules) if module not in (home, script, "__mp_main__"))
     for module in itertools.chain([home], others, [script]):
         for name, value in list(getattr(sys.modules.get(module), "__dict__", {}).items()):

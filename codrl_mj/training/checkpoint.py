@@ -13,7 +13,7 @@ import operator
 import os
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +23,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 
+from codrl_mj.boundary import JsonObject
+from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.runs import find_checkpoints
 from codrl_mj.runs.files import atomic_write, select_prefix
 
@@ -47,16 +49,14 @@ class State(NamedTuple):
 
     arrays: dict[str, np.ndarray]
     """Arrays by name."""
-    facts: dict[str, Any]
+    facts: JsonObject
     """JSON-serializable values by name."""
 
 
-def capture(model: BaseAlgorithm, envs: Any) -> State:
+def capture(model: BaseAlgorithm, envs: ActuatedVecEnv) -> State:
     """Return the state of a model and its environments between two rollouts."""
     arrays: dict[str, np.ndarray] = {}
-    facts: dict[str, Any] = {
-        name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)
-    }
+    facts: JsonObject = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
     modules, tensors = model._get_torch_save_params()
     for module in modules:
         state = operator.attrgetter(module)(model).state_dict()
@@ -84,7 +84,7 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
     if hasattr(model, "snapshot"):
         arrays |= {f"model.{name}": value for name, value in model.snapshot().items()}
     # Stable-Baselines3 draws from NumPy's global generator.
-    numpy_state: Any = np.random.get_state(legacy=False)
+    numpy_state: JsonObject = np.random.get_state(legacy=False)
     arrays["random.numpy.key"] = numpy_state["state"].pop("key")
     facts["random.numpy"] = numpy_state
     facts["random.actions"] = model.action_space.np_random.bit_generator.state
@@ -92,7 +92,7 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
     return State(arrays, facts)
 
 
-def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
+def restore(model: BaseAlgorithm, envs: ActuatedVecEnv, state: State) -> None:
     """Restore the result of `capture` in a model of the same configuration while it learns.
 
     Raises:
@@ -150,18 +150,19 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
         raise ValueError(f"the checkpoint belongs to another configuration: {error!r}") from None
 
 
-def _array(value: Any) -> np.ndarray:
-    return torch.as_tensor(value).detach().cpu().numpy().copy()
+def _array(value: torch.Tensor | float) -> np.ndarray:
+    array: np.ndarray = torch.as_tensor(value).detach().cpu().numpy().copy()
+    return array
 
 
-def _noises(model: Any) -> list[OrnsteinUhlenbeckActionNoise]:
+def _noises(model: BaseAlgorithm) -> list[OrnsteinUhlenbeckActionNoise]:
     """Return the action noises that have a state."""
     noise = getattr(model, "action_noise", None)
     parts = noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]
     return [part for part in parts if isinstance(part, OrnsteinUhlenbeckActionNoise)]
 
 
-def _state_dependent_noise(model: Any) -> StateDependentNoiseDistribution | None:
+def _state_dependent_noise(model: BaseAlgorithm) -> StateDependentNoiseDistribution | None:
     """Return the distribution with state-dependent noise, or None if the model has none."""
     distribution = getattr(getattr(model, "actor", model.policy), "action_dist", None)
     return distribution if isinstance(distribution, StateDependentNoiseDistribution) else None

@@ -3,14 +3,14 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from gymnasium import spaces
 
-from codrl_mj.actuators import allow_imports
+from codrl_mj.actuators import ActuatorModel, allow_imports
 from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import OTHER_ENV, find_preset
+from codrl_mj.boundary import Argument, Json, JsonObject, Options
 from codrl_mj.envs.config import EnvConfig, check_time_limit
 from codrl_mj.fields import Checked, check_names, integer
 from codrl_mj.user_code import read_yaml
@@ -70,15 +70,16 @@ class TrainConfig(Checked):
     @property
     def task(self) -> str:
         """Task name."""
-        return self.env.task
+        name: str = self.env.task
+        return name
 
     @property
-    def actuator(self) -> Any:
+    def actuator(self) -> object:
         """Actuator in training; a tuple if there are several motors or patterns of motor names."""
         return self.env.actuator
 
     @property
-    def actuators(self) -> tuple[Any, ...]:
+    def actuators(self) -> tuple[ActuatorModel, ...]:
         """Actuators in training, always as a tuple."""
         return self.env.actuators
 
@@ -88,9 +89,9 @@ class TrainConfig(Checked):
         task: str,
         agent: str,
         settings: str = "default",
-        actuator: Any = "default",
-        env: Mapping[str, Any] | None = None,
-        **changes: Any,
+        actuator: object = "default",
+        env: Mapping[str, Argument] | None = None,
+        **changes: Argument,
     ) -> "TrainConfig":
         """Return the preset configuration of an agent on a task.
 
@@ -117,15 +118,15 @@ class TrainConfig(Checked):
     @property
     def evaluation_env(self) -> EnvConfig:
         """Environment of evaluations: without the training's changes of time limit and reward."""
-        changed: dict[str, Any] = dict.fromkeys(_evaluation_overrides(self.env))
+        changed: dict[str, Argument] = dict.fromkeys(_evaluation_overrides(self.env))
         return dataclasses.replace(self.env, **changed)
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> JsonObject:
         """Return the configuration as JSON-serializable values, which `from_mapping` reads."""
         return {**vars(self), "env": self.env.as_mapping(), "agent": self.agent.as_mapping()}
 
     @classmethod
-    def from_mapping(cls, mapping: Mapping[str, Any], whole: bool = False) -> "TrainConfig":
+    def from_mapping(cls, mapping: Mapping[str, Json], whole: bool = False) -> "TrainConfig":
         """Return the configuration from a mapping: the result of `as_mapping`, or a part of it.
 
         Missing fields are those of the preset of the agent and `settings` (`default` if missing).
@@ -176,7 +177,7 @@ class TrainConfig(Checked):
         )
 
 
-def default_agent(task: str, options: Any = None) -> str:
+def default_agent(task: str, options: Options = None) -> str:
     """Return the default agent of a task; for the paper's five tasks, the paper's agent.
 
     In third-party environments it is SAC for continuous actions and PPO for other actions. The
@@ -200,7 +201,7 @@ def _evaluation_overrides(env: EnvConfig) -> tuple[str, ...]:
     return () if env.source.time_limit is None else ("max_episode_steps",)
 
 
-def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConfig:
+def read_config(path: Path, trust: bool = False, **overriding: Json) -> TrainConfig:
     """Read a configuration from a YAML (or JSON) file for `TrainConfig.from_mapping`.
 
     Args:

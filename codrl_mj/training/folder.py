@@ -9,11 +9,12 @@ import shutil
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 from filelock import FileLock, Timeout
 
 from codrl_mj.actuators import allow_imports, display_label, set_display_name
+from codrl_mj.boundary import JsonObject
 from codrl_mj.fields import command, differences
 from codrl_mj.runs import (
     BEST,
@@ -37,6 +38,15 @@ from codrl_mj.user_code import UntrustedCodeError, asset_folder
 
 _FILES = {CONFIG, RESULT, EVALUATION, PROGRESS, EPISODES, CURVE, *POLICY_FILES}
 _PACKAGES = ("codrl-mj", "gymnasium", "mujoco", "numba", "numpy", "stable-baselines3", "torch")
+
+
+class Software(TypedDict):
+    """Software on which the result of a run depends."""
+
+    versions: dict[str, str]
+    """Version of Python and of each package."""
+    code: str
+    """SHA-256 digest of the code."""
 
 
 class RunInUseError(RuntimeError):
@@ -78,7 +88,7 @@ def load_config(run: Path, trust: bool = False) -> TrainConfig:
 
 def prepare_run(
     run: Path, config: TrainConfig, resume: bool, accept_changes: bool
-) -> dict[str, Any] | None:
+) -> JsonObject | None:
     """Check a run folder before a training, and return the content of a new `config.json`.
 
     The check comes before anything is created or compiled.
@@ -169,7 +179,7 @@ def _delete_leftovers(run: Path) -> None:
 
 
 def check_resumable(
-    run: Path, config: TrainConfig, software: Mapping[str, Any], accept_changes: bool
+    run: Path, config: TrainConfig, software: Software, accept_changes: bool
 ) -> None:
     """Raise if continuing a training might not give the result of an uninterrupted training.
 
@@ -216,7 +226,7 @@ def check_resumable(
         )
 
 
-def provenance(config: TrainConfig) -> dict[str, Any]:
+def provenance(config: TrainConfig) -> Software:
     """Return the versions of packages and the digest of code on which a run's result depends.
 
     The code is that of this package, and the files of custom tasks, models, agents and families of

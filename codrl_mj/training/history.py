@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from codrl_mj.plots import Curve, Plot, save_png
 from codrl_mj.runs.files import atomic_write
-from codrl_mj.viz.pages.plots import Curve, Plot, save_png
 
 WINDOW = 100
 """Number of training episodes in running means."""

@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from types import FrameType
 
 from codrl_mj.evaluation import check_episodes
 from codrl_mj.runs import CONFIG, finished
@@ -120,7 +120,7 @@ def collecting_signals(*signals: int) -> Iterator[list[int]]:
         yield received
         return
 
-    def collect(number: int, _: Any) -> None:
+    def collect(number: int, _: FrameType | None) -> None:
         if received and number == signal.SIGINT:
             raise KeyboardInterrupt
         received.append(number)
@@ -135,13 +135,13 @@ def collecting_signals(*signals: int) -> Iterator[list[int]]:
 
 def _wandb_context(
     wandb_project: str | None, out: Path, config: TrainConfig
-) -> contextlib.AbstractContextManager[Any]:
+) -> contextlib.AbstractContextManager[object]:
     """Return a context in which Weights & Biases receives the events for TensorBoard."""
     if wandb_project is None:
         return contextlib.nullcontext()
     import wandb
 
-    return wandb.init(
+    run: contextlib.AbstractContextManager[object] = wandb.init(
         project=wandb_project,
         name=out.name,
         dir=out,
@@ -151,3 +151,4 @@ def _wandb_context(
         id=hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:16],
         resume="allow",
     )
+    return run

@@ -39,7 +39,7 @@ class TrainingCompleted(Exception):  # noqa: N818 - no error
     """Raised to leave Stable-Baselines3's learning loop after the last step of a training."""
 
 
-class Watcher(BaseCallback):
+class Watcher(BaseCallback):  # mypy does not read the base
     """Callback of every training run, which acts between two rollouts."""
 
     def __init__(
@@ -71,7 +71,7 @@ class Watcher(BaseCallback):
 
     def _on_training_start(self) -> None:
         """Restore the last checkpoint after the model has initialized itself."""
-        self._arms = self.training_env.arm_radii  # type: ignore[attr-defined]
+        self._arms = self.training_env.arm_radii
         if any(path.endswith("arm_radius") for path in self._config.env.distributions):
             # With a randomized arm radius, no single value is valid for all episodes.
             self._arms = np.full_like(self._arms, math.nan)
@@ -116,7 +116,7 @@ class Watcher(BaseCallback):
     def _on_step(self) -> bool:
         # An agent's compiled loop takes several steps in one call, and passes the signals of all of
         # them.
-        signals = self.locals.get("signals", self.training_env.signals)  # type: ignore[attr-defined]
+        signals = self.locals.get("signals", self.training_env.signals)
         if signals is not None:
             errors = np.subtract(signals["desired_force"], signals["actual_force"]).reshape(
                 -1, len(self._arms)
@@ -204,7 +204,7 @@ class Watcher(BaseCallback):
 
     def _due(self, action: str, interval: int) -> bool:
         mark = self.model.num_timesteps // interval
-        due = mark > self._marks[action]
+        due: bool = mark > self._marks[action]
         self._marks[action] = mark
         return due
 

@@ -7,7 +7,6 @@ import math
 import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import mujoco
 
@@ -70,9 +69,9 @@ class Certificate:
         """Short text with the number of checks that failed or passed."""
         return verdict([check.passed for check in self.checks])
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> dict[str, object]:
         """Return all fields except the plots, for JSON; infinities and NaN become text."""
-        checks: list[dict[str, Any]] = []
+        checks: list[dict[str, object]] = []
         for check in self.checks:
             row = {
                 field.name: getattr(check, field.name)
@@ -217,8 +216,11 @@ def _convert_errors(outcomes: Outcomes) -> Outcomes:
         yield Check(DIVERGED, "itself", 0.0, "", 1, math.inf, reason)
 
 
-def _checks_of(group: str, has_task: bool) -> Callable[[Any, bool], Outcomes]:
-    """Return the function (task, quick) that runs a group's checks."""
+def _checks_of(group: str, has_task: bool) -> Callable[..., Outcomes]:
+    """Return the function (task, quick) that runs a group's checks.
+
+    The task is a name; it is None for a group of `TASK_INDEPENDENT` on all built-in tasks.
+    """
     # The imports are local because some groups need optional libraries. A missing library then
     # skips its own group only (`_convert_errors`).
     if group == "dynamics":

@@ -5,10 +5,11 @@ Differences are relative to the size of an entry; angles are compared on the cir
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.envs.classic_control import acrobot
 
 from codrl_mj.actuators import ActuatorModel, CurrentLoop, DCMotorActuator, spectral_radius
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationConfig
@@ -35,7 +36,8 @@ def differences(task: Task, ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
         inside = np.maximum(np.abs(ours[..., entry]), np.abs(oracle[..., entry])) <= np.pi
         other_way = np.abs(2 * np.pi - gap[..., entry])
         gap[..., entry] = np.where(inside, np.minimum(gap[..., entry], other_way), gap[..., entry])
-    return gap / np.maximum(1.0, np.abs(oracle))
+    relative: np.ndarray = gap / np.maximum(1.0, np.abs(oracle))
+    return relative
 
 
 def is_built_in(task: Task) -> bool:
@@ -73,13 +75,13 @@ def physics_classes(task: Task) -> tuple[tuple[str, type], ...]:
     return PHYSICS if task.reference_env is not None else PHYSICS[:1]
 
 
-def named_actuators(name: str, task: Task) -> tuple[Any, ...]:
-    """Return the named actuator for each motor of a task.
+def named_actuators(name: str, task: Task) -> tuple[ActuatorModel, ...]:
+    """Return the named actuator for each motor of a task."""
+    return _fallback_actuators(task) if name == FALLBACK_ACTUATOR else resolve_actuators(name, task)
 
-    `FALLBACK_ACTUATOR` is sampled as often as it needs to be stable.
-    """
-    if name != FALLBACK_ACTUATOR:
-        return resolve_actuators(name, task)
+
+def _fallback_actuators(task: Task) -> tuple[DCMotorActuator, ...]:
+    """Return default current loops for all motors, sampled as often as they need to be stable."""
     timestep, actuator = task.step_duration / task.motor_inner_steps, DCMotorActuator()
     while not spectral_radius(actuator, timestep) < 1.0:
         actuator = DCMotorActuator(
@@ -90,7 +92,7 @@ def named_actuators(name: str, task: Task) -> tuple[Any, ...]:
 
 def paper_actuators(task: Task) -> tuple[DCMotorActuator, ...]:
     """Return the paper's actuators of a task, or `FALLBACK_ACTUATOR` for each motor."""
-    return task.paper or named_actuators(FALLBACK_ACTUATOR, task)
+    return task.paper or _fallback_actuators(task)
 
 
 def scaled_forces(task: Task, shares: np.ndarray) -> np.ndarray:
@@ -99,7 +101,8 @@ def scaled_forces(task: Task, shares: np.ndarray) -> np.ndarray:
     `shares` has the shape (steps * motors,).
     """
     forces = task.max_forces * shares.reshape(-1, len(task.motors))
-    return forces[:, 0] if len(task.motors) == 1 else forces
+    scaled: np.ndarray = forces[:, 0] if len(task.motors) == 1 else forces
+    return scaled
 
 
 STATE_BOUNDS = {
@@ -110,8 +113,15 @@ STATE_BOUNDS = {
 }
 """Attribute that bounds the states of an environment -> value that removes the bound."""
 
-Equations = Callable[[np.ndarray, Any], np.ndarray]
-"""(mechanical state, force [N or N*m], an array for several motors) -> derivative of the state."""
+Force = float | np.ndarray
+"""Force [N] or torque [N*m]; an array for several motors."""
+Equations = Callable[[np.ndarray, Force], np.ndarray]
+"""(mechanical state, force) -> derivative of the state."""
+Slope = Callable[[np.ndarray], np.ndarray]
+"""State -> its derivative."""
+# Gymnasium's function has no types.
+rk4: Callable[[Slope, np.ndarray, Sequence[float]], np.ndarray] = acrobot.rk4
+"""(derivative, state, times) -> the state after steps of Gymnasium's Runge-Kutta method."""
 
 
 def gymnasium_equations(task: Task, dt: float | None = None) -> Equations:
@@ -127,7 +137,8 @@ def gymnasium_equations(task: Task, dt: float | None = None) -> Equations:
     # A reference environment has few declared attributes; bounds are found by their names.
     env: Any = task.reference_env()
     if hasattr(env, "derivative"):
-        return env.derivative
+        equations: Equations = env.derivative
+        return equations
     for owner, name in itertools.product((env, getattr(env, "env", None)), STATE_BOUNDS):
         if hasattr(owner, name):
             setattr(owner, name, STATE_BOUNDS[name])
@@ -135,7 +146,7 @@ def gymnasium_equations(task: Task, dt: float | None = None) -> Equations:
     step = 2.0 ** math.floor(math.log2(task.step_duration / 4)) if dt is None else dt
     qpos, qvel, integrator = list(task.qpos), list(task.qvel), task.integrators[0]
 
-    def derivative(state: np.ndarray, force: float) -> np.ndarray:
+    def derivative(state: np.ndarray, force: Force) -> np.ndarray:
         change = np.empty_like(state)
         change[qpos] = state[qvel]
         change[qvel] = (np.asarray(env(state, force, step, integrator))[qvel] - state[qvel]) / step

@@ -33,6 +33,7 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, DCMotorActuator, Motor
 from codrl_mj.physics import SimulationConfig, SimulationDivergedError, hills, trace_names
+from codrl_mj.plots import Curve, Plot
 from codrl_mj.tasks import Task, find_task
 from codrl_mj.user_code import asset_path
 from codrl_mj.validation.compare import (
@@ -59,7 +60,6 @@ from codrl_mj.validation.table import (
     order_case,
     order_check,
 )
-from codrl_mj.viz.pages.plots import Curve, Plot
 
 ACTUATORS = ("paper", "weak", "weaker", "open_loop")
 """Named actuators whose runs are balanced step by step."""
@@ -171,11 +171,12 @@ class Ledger:
         remaining = (
             self.shaft if balance == "mechanical" else self.supplied - self.copper - self.magnetic
         )
-        return (
+        residual: np.ndarray = (
             remaining - self.converted
             if balance == "electrical"
             else remaining - self.mechanical - self.lost
         )
+        return residual
 
 
 def record_energies(

@@ -56,7 +56,8 @@ def differs(ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
     ours, oracle = (
         np.ascontiguousarray(array, dtype=np.float64).view(np.uint64) for array in (ours, oracle)
     )
-    return ours != oracle
+    different: np.ndarray = ours != oracle
+    return different
 
 
 def bit_differences(ours: np.ndarray, oracle: np.ndarray) -> Case:

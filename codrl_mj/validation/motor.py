@@ -38,6 +38,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from codrl_mj.actuators import DCMotorActuator, Motor
+from codrl_mj.plots import Curve, Plot
 from codrl_mj.validation.motor_catalogue import drive_checks
 from codrl_mj.validation.motor_loops import order_to_closed_form, sampled_checks
 from codrl_mj.validation.own_model import compiled_checks
@@ -62,7 +63,6 @@ from codrl_mj.validation.table import (
     order_case,
     order_check,
 )
-from codrl_mj.viz.pages.plots import Curve, Plot
 
 MOTORS: dict[str, Motor] = {
     "paper": Motor(),

@@ -15,16 +15,16 @@ parameters of a `Drive`.
 
 import math
 from collections.abc import Iterator
+from typing import cast
 
 import numpy as np
-from gymnasium.envs.classic_control.acrobot import rk4
 from scipy.linalg import expm
 
 from codrl_mj.actuators import Drive, resolve
 from codrl_mj.catalogue import motor_names
 from codrl_mj.physics import MujocoPhysics, SimulationConfig, SimulationDivergedError
 from codrl_mj.tasks import Task
-from codrl_mj.validation.compare import differences, gymnasium_equations
+from codrl_mj.validation.compare import differences, gymnasium_equations, rk4
 from codrl_mj.validation.rotors import LOCKED_ROTOR, build_rotors, simulate
 from codrl_mj.validation.table import Case, Check, check
 
@@ -56,8 +56,7 @@ def task_drive(task: str) -> Drive:
     """Return the drive of `TASK_MOTORS` for a task."""
     name, motor, rate = TASK_MOTORS[task]
     fields = {"name": name, "motor": {**NO_HEATING, **motor}, "controller": {"sample_rate": rate}}
-    actuator: Drive = resolve(fields, None, task)
-    return actuator
+    return cast(Drive, resolve(fields, None, task))
 
 
 class DriveOracle:
@@ -240,7 +239,9 @@ def drive_checks(quick: bool) -> Iterator[tuple[Case, ...]]:
     fields = {"motor": NO_HEATING | {"load_inertia": math.inf}, "controller": {"sample_rate": 20e3}}
     # Designed gains allow the closed form of a whole step. Explicit gains, even of the same values,
     # make the engine compute every sample.
-    closed_form = {name: resolve({"name": name, **fields}, None, name) for name in motor_names()}
+    closed_form = {
+        name: cast(Drive, resolve({"name": name, **fields}, None, name)) for name in motor_names()
+    }
     oracles = [DriveOracle(actuator, timestep) for actuator in closed_form.values()]
     stepping = [
         actuator.replaced({"controller.kp": oracle.kp, "controller.ki": oracle.ki * 20e3})

@@ -7,13 +7,13 @@ The oracles are a closed form, scipy and python-control. Each is built from the 
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 import control
 import numpy as np
 from scipy import linalg, signal
 
 from codrl_mj.actuators import DCMotorActuator
+from codrl_mj.plots import Curve, Plot
 from codrl_mj.validation.rotors import (
     LOCKED_ROTOR,
     Loop,
@@ -23,7 +23,6 @@ from codrl_mj.validation.rotors import (
     simulate_torques,
 )
 from codrl_mj.validation.table import Case, Check, ConvergenceSeries, check, order_case, order_check
-from codrl_mj.viz.pages.plots import Curve, Plot
 
 # -- The continuous loop that is sampled -----------------------------------------------------------
 
@@ -105,8 +104,8 @@ def order_to_closed_form(loops: Mapping[str, Loop], quick: bool) -> Iterator[tup
 # -- The sampled loop as a state-space system ------------------------------------------------------
 
 
-def sampled_system(actuator: DCMotorActuator, timestep: float) -> Any:
-    """Return the loop sampled at its electrical step, as a `dlti`.
+def sampled_system(actuator: DCMotorActuator, timestep: float) -> signal.dlti:
+    """Return the loop sampled at its electrical step.
 
     Inputs are the reference current and the shaft speed, the output is the next current.
     """
@@ -169,8 +168,8 @@ def random_torques(loops: Mapping[str, Loop], steps: int) -> Iterator[Case]:
 # -- The sampled loop as blocks --------------------------------------------------------------------
 
 
-def closed_loop(actuator: DCMotorActuator, timestep: float) -> Any:
-    """Return python-control's discrete system from desired torque to torque at the step's start.
+def closed_loop(actuator: DCMotorActuator, timestep: float) -> control.StateSpace:
+    """Return the discrete system from desired torque to torque at the step's start.
 
     The torque is kT times the current; the sampling period is `timestep`.
     As in Algorithm 1, the winding is 1/(L s + R) sampled by forward Euler, and the integral is

@@ -11,9 +11,8 @@ import math
 import sys
 import types
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
-from typing import Any
 from unittest import mock
 
 import mujoco
@@ -24,7 +23,7 @@ from codrl_mj.actuators import ActuatorModel, current_loop, drive
 from codrl_mj.engine import control
 from codrl_mj.engine.families import SLOT_HEADER_SIZE, family_replaced
 from codrl_mj.engine.hill import GRAVITY
-from codrl_mj.physics import MujocoPhysics, compiled_task, mjcf
+from codrl_mj.physics import MujocoPhysics, SimulationConfig, compiled_task, mjcf
 from codrl_mj.physics.variation import bare_model
 from codrl_mj.tasks import PAPER_TASKS, find_task
 from codrl_mj.validation.certificate import (
@@ -40,7 +39,7 @@ Fault = contextlib.AbstractContextManager[object]
 
 
 @contextlib.contextmanager
-def _everywhere(name: str, original: Any, wrong: Any) -> Iterator[None]:
+def _everywhere(name: str, original: object, wrong: object) -> Iterator[None]:
     """Replace `original` by `wrong` in every module of the package that has it as `name`."""
     # Modules that ran `from … import …` hold their own references.
     modules = [module for key, module in sys.modules.items() if key.startswith("codrl_mj")]
@@ -63,8 +62,8 @@ def wrong_model(*parts: Part) -> Iterator[None]:
     """Scale parts of every task's model; parts that a model does not have are skipped."""
     build = mjcf.task_model
 
-    def build_wrong(*arguments: Any, **options: Any) -> mujoco.MjModel:
-        model = build(*arguments, **options)
+    def build_wrong(simulation: SimulationConfig) -> mujoco.MjModel:
+        model = build(simulation)
         for field, index, factor in parts:
             owner = model.opt if hasattr(model.opt, field) else model
             if index is None:
@@ -112,11 +111,12 @@ _HIDDEN = np.zeros(64)
 
 
 @cache
-def _wrong_callbacks(edits: tuple[Edit, ...]) -> Callable[[], Any]:
+def _wrong_callbacks(edits: tuple[Edit, ...]) -> Callable[[], Mapping[str, object]]:
     """Return the function that compiles the callbacks of the edited source."""
     wrong = compile_edited(control, edits)
-    wrong.HIDDEN = _HIDDEN.ctypes.data  # type: ignore[attr-defined]
-    return wrong.motor_callbacks
+    vars(wrong)["HIDDEN"] = _HIDDEN.ctypes.data
+    callbacks: Callable[[], Mapping[str, object]] = wrong.motor_callbacks
+    return callbacks
 
 
 @contextlib.contextmanager
@@ -210,19 +210,20 @@ _SHARED_CURRENT: tuple[Edit, ...] = (
 _STEP, _MAKE, _RESET = MujocoPhysics.step, MujocoPhysics.__init__, MujocoPhysics.reset
 
 
-def _late(self: Any, desired_force: float) -> Any:
+def _late(self: MujocoPhysics, desired_force: float) -> None:
     """Take a step with the command of the step before."""
-    force, self.waiting = getattr(self, "waiting", 0.0), desired_force
-    return _STEP(self, force)
+    force = vars(self).get("waiting", 0.0)
+    vars(self)["waiting"] = desired_force
+    _STEP(self, force)
 
 
-def _explicit(self: Any, simulation: Any) -> None:
+def _explicit(self: MujocoPhysics, simulation: SimulationConfig) -> None:
     """Create the physics with the other Euler integrator."""
     wrong_integrator = "semi-implicit" if simulation.integrator == "euler" else "euler"
     _MAKE(self, dataclasses.replace(simulation, integrator=wrong_integrator))
 
 
-def _warm(self: Any, state: np.ndarray, key: float = 0.0) -> None:
+def _warm(self: MujocoPhysics, state: np.ndarray, key: float = 0.0) -> None:
     """Reset the mechanics but not the motor."""
     motor = self.data.act.copy()
     _RESET(self, state, key)
@@ -440,11 +441,11 @@ def try_mutations(
     return results
 
 
-def as_mapping(certificate: Certificate, results: Sequence[MutationResult]) -> dict[str, Any]:
+def as_mapping(certificate: Certificate, results: Sequence[MutationResult]) -> dict[str, object]:
     """Return the results of the faults as JSON-serializable values; empty without faults."""
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     for result in results:
-        row: dict[str, Any] = {
+        row: dict[str, object] = {
             "mutation": result.mutation,
             "task": result.task,
             "made": result.num_checks,

@@ -31,8 +31,9 @@ from codrl_mj.actuators import (
     spectral_radius,
 )
 from codrl_mj.engine import load_family
-from codrl_mj.engine.families import SLOT_HEADER_SIZE, SlotHeader, slot_size
+from codrl_mj.engine.families import SLOT_HEADER_SIZE, SlotHeader
 from codrl_mj.engine.model_access import shaft_inertia
+from codrl_mj.engine.mounting import arm_outside_gear, desired_input
 from codrl_mj.engine.reading import actuators_sharing_motor, motor_slots
 from codrl_mj.engine.specs import describe_duplicate_dynamics
 from codrl_mj.physics import SimulationConfig, install_callbacks, motors
@@ -85,7 +86,7 @@ def compared_names(actuator: ActuatorModel) -> tuple[str, ...]:
     They are the states and signals after a step and the torque that the engine applied.
     """
     # mypy does not know the State and Signals classes that each family defines.
-    return (*actuator.State._fields, *actuator.Signals._fields, "torque")  # type: ignore[attr-defined]
+    return (*actuator.State._fields, *actuator.Signals._fields, "torque")
 
 
 def compare_with_python(
@@ -113,7 +114,7 @@ def compare_with_python(
         for index, actuator in actuators.items()
     }
     states = {
-        index: kind.State(*[0.0] * len(kind.State._fields)) for index, kind in families.items()
+        index: kind.State._make([0.0] * len(kind.State._fields)) for index, kind in families.items()
     }
     results = {
         index: np.empty((2, len(controls), len(compared_names(actuator))))
@@ -129,8 +130,7 @@ def compare_with_python(
         mujoco.mj_step(model, data)
         for index, actuator in actuators.items():
             output = model.actuator_outadr[index]
-            # With the callbacks the arm radius is part of the model's gear.
-            arm = 1.0 if model.actuator_plugin[index] < 0 else actuator.arm_radius
+            arm = arm_outside_gear(model, index, actuator)
             motion = (
                 float(before.actuator_length[output]) / arm,
                 float(before.actuator_velocity[output]) / arm,
@@ -140,10 +140,7 @@ def compare_with_python(
             command = (
                 float(np.clip(command, *range_)) if model.actuator_ctrllimited[address] else command
             )
-            if model.actuator_plugin[index] < 0 or actuator.MOTION:
-                desired = command / arm
-            else:
-                desired = float(slot_of[index][slot_size(families[index])]) * arm
+            desired = desired_input(model, index, actuator, slot_of[index], command)
             inertia = (
                 shaft_inertia(model, before, output, 1.0 / arm) if actuator.INERTIA else math.inf
             )

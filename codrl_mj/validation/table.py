@@ -9,12 +9,13 @@ import dataclasses
 import functools
 import inspect
 import math
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from codrl_mj.viz.pages.plots import Curve, Plot
+from codrl_mj.plots import Curve, Plot
 
 ORDER_TOLERANCE = 0.1
 """Largest distance of either end of a slope's 95 % interval from the promised order.
@@ -102,8 +103,7 @@ def order_check(name: str, oracle: str) -> Check:
 class Case(NamedTuple):
     """Differences of one comparison."""
 
-    # A number or an array of any shape.
-    gaps: Any
+    gaps: ArrayLike
     """Differences, a number or an array, each >= 0 or NaN."""
     where: str | Callable[[int], str] = ""
     """Description of the case, or a function of the flat index of the largest difference."""
@@ -132,9 +132,8 @@ def check(group: str, *rows: Check) -> Callable[[Callable[..., Cases]], Callable
     def register(cases: Callable[..., Cases]) -> Callable[..., list[Check]]:
         signature = inspect.signature(cases)
 
-        # The arguments are those of any check, hence Any.
         @functools.wraps(cases)
-        def run_check(*arguments: Any, **keywords: Any) -> list[Check]:
+        def run_check(*arguments: object, **keywords: object) -> list[Check]:
             # Keyword arguments that the check itself does not take only fill in its rows.
             extra = {
                 name: keywords.pop(name)
@@ -157,7 +156,7 @@ def check(group: str, *rows: Check) -> Callable[[Callable[..., Cases]], Callable
     return register
 
 
-def evaluate_cases(row: Check, fields: dict[str, Any], cases: Iterable[Case]) -> Check:
+def evaluate_cases(row: Check, fields: Mapping[str, object], cases: Iterable[Case]) -> Check:
     """Return a row with the result of its cases.
 
     The worst case has the largest difference; of equal ones it is the first. A NaN is larger than
@@ -184,13 +183,15 @@ def evaluate_cases(row: Check, fields: dict[str, Any], cases: Iterable[Case]) ->
     if worst < 0.0:
         worst, description = 0.0, NO_DIFFERENCE
     name, oracle = (text.format_map(fields) for text in (row.name, row.oracle))
-    results: dict[str, Any] = {
-        "samples": samples,
-        "worst": worst,
-        "where": description,
-        "plots": tuple(plots),
-    }
-    return dataclasses.replace(row, name=name, oracle=oracle, **results)
+    return dataclasses.replace(
+        row,
+        name=name,
+        oracle=oracle,
+        samples=samples,
+        worst=worst,
+        where=description,
+        plots=tuple(plots),
+    )
 
 
 # -- orders of convergence -------------------------------------------------------------------------

@@ -15,11 +15,11 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.physics import AnalyticPhysics, SimulationDivergedError, trace_names
+from codrl_mj.plots import Curve, Plot
 from codrl_mj.tasks import Task, find_task, named_actuator
 from codrl_mj.validation.compare import differences, missing_oracle_reason, physics_pair
 from codrl_mj.validation.motor_catalogue import TASK_MOTORS, task_motor_run
 from codrl_mj.validation.table import Case, Check, Skipped, check
-from codrl_mj.viz.pages.plots import Curve, Plot
 
 TOLERANCE = 1e-9
 """Largest difference up to the horizon, relative.

@@ -2,12 +2,13 @@
 
 import contextlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 
+from codrl_mj.boundary import Argument
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.physics.offscreen import check_view
@@ -35,7 +36,7 @@ class Scene(NamedTuple):
 
 def render_arguments(
     env: EnvConfig, width: int, height: int, camera: str | None
-) -> dict[str, Any] | None:
+) -> dict[str, Argument] | None:
     """Return arguments of `EnvConfig.build` for images; None if recorded states are rendered.
 
     Args:

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from actuator_study import arms
-from codrl_mj.study.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, LossBounds, advise, decide
+from codrl_mj.study.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, advise, decide
 from codrl_mj.study.axes import AXES, SECONDS, study_env
-from codrl_mj.study.evidence import Evidence
+from codrl_mj.study.evidence import Evidence, LossBounds
 from codrl_mj.study.questions import MARGIN
 
 

@@ -70,7 +70,9 @@ CURVES: dict[str, list[StateCurve]] = {
         StateCurve("height x = cos θ [m]", lambda state: np.cos(state[0]), (1.0,)),
         StateCurve("y = sin θ [m]", lambda state: np.sin(state[0]), (0.0,)),
         StateCurve(
-            "θ [rad], wrapped", lambda state: _unbroken(pendulum.upright_angle(state)), (0.0,)
+            "θ [rad], wrapped",
+            lambda state: _unbroken(np.asarray(pendulum.upright_angle(state))),
+            (0.0,),
         ),
         _entry("θ_dot [rad/s]", 1, 0.0),
     ],

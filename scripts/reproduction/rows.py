@@ -9,13 +9,13 @@ import numpy as np
 
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import holds_since
+from codrl_mj.runs import EPISODES
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.pages import read_csv
 from codrl_mj.study.trials import StudyResults, to_scalar, training_seconds
 from codrl_mj.tasks import TASKS
 from codrl_mj.tasks.pendulum import GOAL_HOLD, MAX_TORQUE, upright_angle
 from codrl_mj.training import EVALUATION_SEED
-from codrl_mj.training.folder import EPISODES
 from codrl_mj.training.history import EPISODE_COLUMNS, read_episodes
 from reproduction.arms import CENTRE, TEST, PaperArm
 
@@ -211,6 +211,7 @@ def by_epoch(run: Trained, steps: int, count: int) -> Epochs:
 
     def mean(column: str) -> np.ndarray:
         sums = np.bincount(epoch, run.column(column), minlength=count)[:count]
-        return np.divide(sums, numbers, out=np.full(count, np.nan), where=numbers > 0)
+        means: np.ndarray = np.divide(sums, numbers, out=np.full(count, np.nan), where=numbers > 0)
+        return means
 
     return Epochs(mean("return"), mean("length"), numbers)

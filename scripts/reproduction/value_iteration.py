@@ -139,7 +139,8 @@ def iterate(
         raise ValueError(f"discount = {discount}: must be from 0 to below 1")
     values = np.zeros(rewards.shape[1])
     while True:
-        action_values = rewards + discount * (transitions @ values).reshape(rewards.shape)
+        future = (transitions @ values).reshape(rewards.shape)
+        action_values: np.ndarray = rewards + discount * future
         best = action_values.max(axis=0)
         change = np.abs(best - values).max()
         values = best

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from markupsafe import Markup
 
+from codrl_mj.plots import Curve, Plot
 from codrl_mj.sizing import find_drive, find_entry
 from codrl_mj.viz.pages import page as builder
 from codrl_mj.viz.pages.motor import motor_page
-from codrl_mj.viz.pages.plots import Curve, Plot
 from codrl_mj.viz.pages.report import replay_parts, report
 from tests.browser.waiting import until
 

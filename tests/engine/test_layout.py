@@ -170,3 +170,37 @@ def test_a_wrong_layout_is_not_compiled(owner, monkeypatch):
 
     with pytest.raises(LayoutError, match=f"MuJoCo {mujoco.__version__}: {owner}"):
         read.compile("float64(uintp)")
+
+
+DECLARED = [
+    (struct_name, name, kind)
+    for struct_name, fields in (
+        ("mjModel", layout.ModelFields),
+        ("mjData", layout.DataFields),
+        ("mjOption", layout.OptionFields),
+    )
+    for name, kind in vars(fields)["__annotations__"].items()
+    if kind is not layout.OptionFields
+]
+
+
+def test_exactly_the_fields_that_are_used_have_a_type():
+    used = {
+        ("mjOption", field[4:]) if field.startswith("opt.") else (owner, field)
+        for owner, field in USED
+    }
+    assert {(struct_name, name) for struct_name, name, _ in DECLARED} == used
+
+
+@pytest.mark.parametrize(("struct_name", "name", "kind"), DECLARED)
+def test_a_fields_type_is_that_of_the_c_headers(struct_name, name, kind):
+    node = next(field.type for field in layout.STRUCTS[struct_name].fields if field.name == name)
+    is_array = isinstance(node, layout.ast_nodes.PointerType)
+    is_float = (node.inner_type if is_array else node).name == "mjtNum"
+    expected = {
+        (True, True): layout.FloatArray,
+        (True, False): layout.IntArray,
+        (False, True): layout.FloatField,
+        (False, False): layout.IntField,
+    }
+    assert kind == expected[is_array, is_float]

@@ -68,7 +68,7 @@ def test_a_current_command_equals_the_force_command_of_its_torque(task, physics)
         else:
             # The task's own actions do not include every force.
             by_force.physics.step(force)
-            expected = by_force.setup.signals(by_force.physics.trace[-1][0].tolist(), force)
+            expected = by_force.bank.signals(by_force.physics.trace[-1][0].tolist(), force)
             info = env.step(action)[-1]
         assert info["desired_force"] == pytest.approx(force, rel=1e-12)
         assert info["reference_current"] == pytest.approx(command_of_action(env, action), rel=1e-12)

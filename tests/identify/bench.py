@@ -6,7 +6,8 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from codrl_mj.identify import Log, read_log
-from codrl_mj.identify.simulation import ShaftParameters, simulate_shaft
+from codrl_mj.identify.parameters import ShaftParameters
+from codrl_mj.identify.simulation import simulate_shaft
 from tests.published import published_folder
 
 PENDULUM = "time=time:s,position=position:rad,torque=torque:N*m"

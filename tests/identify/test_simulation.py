@@ -7,13 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from codrl_mj.identify.log import Log
+from codrl_mj.identify.parameters import ShaftParameters
 from codrl_mj.identify.result import closed_loop_error
-from codrl_mj.identify.simulation import (
-    ShaftParameters,
-    simulate_servo,
-    simulate_shaft,
-    simulate_winding,
-)
+from codrl_mj.identify.simulation import simulate_servo, simulate_shaft, simulate_winding
 
 STILL = ShaftParameters(0.2, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
 

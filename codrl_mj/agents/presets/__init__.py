@@ -11,9 +11,9 @@ import dataclasses
 import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
-from typing import Any
 
 from codrl_mj.agents import AGENTS, AgentConfig, find_agent
+from codrl_mj.boundary import Json
 
 __all__ = ["OTHER_ENV", "PRESETS", "SETTINGS", "Preset", "find_preset"]
 
@@ -37,7 +37,7 @@ class Preset:
     """Total number of training episodes; None if `total_steps` limits the training."""
     num_envs: int = 1
     """Number of parallel environments."""
-    env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    env: Mapping[str, Json] = dataclasses.field(default_factory=dict)
     """Fields of the training environment and options of the task that differ from the defaults."""
     about: str = ""
     """Source of the settings; for `repaired`, each deviation from the paper with its reason."""

@@ -13,13 +13,15 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium
 import numpy as np
 
+from codrl_mj.boundary import Action, Argument, Info, Observation
+from codrl_mj.envs.config import Env, EnvConfig
 from codrl_mj.envs.single import ActuatedEnv
-from codrl_mj.evaluation.episodes import Episode, run_episodes
+from codrl_mj.evaluation.episodes import Episode, Policy, run_episodes
 from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.runs.files import atomic_folder, atomic_write
 from codrl_mj.viz.films.strip import (
@@ -45,13 +47,13 @@ _MAX_FPS, _MAX_FRAMES = 30, 600
 _TERMINATED_COLOR, _TIME_LIMIT_COLOR = "#B03A2E", "#1E8449"
 
 
-class FrameRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
+class FrameRecorder(gymnasium.Wrapper[Observation, Action, Observation, Action]):
     """Wrapper that stores an image of every instant of an episode.
 
     The images are compressed: raw ones would fill a gigabyte.
     """
 
-    def __init__(self, env: "gymnasium.Env[Any, Any]", pretty: bool = False) -> None:
+    def __init__(self, env: Env, pretty: bool = False) -> None:
         """Wrap an environment.
 
         Args:
@@ -68,19 +70,20 @@ class FrameRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
             # image.
             quality.shadowsize = quality.offsamples = 0
 
-    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+    def reset(self, **options: Argument) -> tuple[Observation, Info]:
         """Start an episode and its recording."""
         result = self.env.reset(**options)
         self._packed: list[tuple[tuple[int, ...], bytes]] = []
         self._store_frame(self.env.render())
         return result
 
-    def step(self, action: Any) -> Any:
+    def step(self, action: Action) -> tuple[Observation, SupportsFloat, bool, bool, Info]:
         """Advance by one environment step."""
         result = self.env.step(action)
         self._store_frame(self.env.render())
         return result
 
+    # Gymnasium declares other types of images too, which `rgb_array` excludes.
     def _store_frame(self, image: Any) -> None:
         self._packed.append((image.shape, zlib.compress(image.tobytes(), 1)))
 
@@ -107,8 +110,8 @@ class Panel:
 
 
 def record(
-    policy: Any,
-    env: Any,
+    policy: Policy,
+    env: EnvConfig,
     seed: int,
     width: int,
     height: int,
@@ -121,11 +124,11 @@ def record(
     default camera. Tasks are rendered later from their states.
     """
     render_options = render_arguments(env, width, height, None if camera == "fixed" else camera)
-    recorders = []
+    recorders: list[FrameRecorder] = []
     if render_options is None:
         return Panel(env.task, run_episodes(policy, env.build, 1, seed)[0])
 
-    def make_recorder() -> Any:
+    def make_recorder() -> FrameRecorder:
         recorders.append(FrameRecorder(env.build(**render_options), pretty))
         return recorders[-1]
 
@@ -152,7 +155,7 @@ def _scene(
 
         yield recorder.metadata.get("render_fps") or 1.0 / float(episode.time[0]), resized_image
         return
-    env: Any = ActuatedEnv(panel.task, "ideal")
+    env = ActuatedEnv(panel.task, "ideal")
     with contextlib.closing(OffscreenRenderer(env.model, *size, camera, pretty)) as renderer:
 
         def render_state(instant: int) -> np.ndarray:
@@ -288,7 +291,7 @@ def _encoding(
     """
     import imageio
 
-    options: dict[str, Any] = {"duration": 1000 / fps, "loop": 0}  # ms
+    options: dict[str, Argument] = {"duration": 1000 / fps, "loop": 0}  # ms
     if out.suffix == ".mp4":
         options = {
             "fps": fps,

@@ -1,11 +1,11 @@
 """Plots below a film's scene: desired and actual torque and one more signal, over time."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Ideal
+from codrl_mj.boundary import Artist, Axes, Figure
 from codrl_mj.evaluation.episodes import Episode
 from codrl_mj.tasks import TASKS
 
@@ -72,12 +72,12 @@ def draw_strip(
     frame = _figure(width, HEADER_HEIGHT + body)
     length = round(scale * end)
     content = _figure(length + MARGIN, body)
-    if isinstance(episode.actuator, tuple):
+    actuator = episode.actuator
+    if isinstance(actuator, tuple):
+        actuator = actuator[motor]
         motor_signals = {name: values[:, motor] for name, values in episode.signals.items()}
-        episode = dataclasses.replace(
-            episode, signals=motor_signals, actuator=episode.actuator[motor]
-        )
-    actuator, lines = episode.actuator, []
+        episode = dataclasses.replace(episode, signals=motor_signals, actuator=actuator)
+    lines = []
     for bottom, height, plot, label in (
         (
             TIME_HEIGHT + VOLTAGE_HEIGHT + GAP,
@@ -92,7 +92,7 @@ def draw_strip(
         # without labels in the wide image.
         axis = frame.add_axes((AXIS_WIDTH / width, bottom / total, 1e-6, height / total))
         axes = content.add_axes((0, bottom / body, length / (length + MARGIN), height / body))
-        lines += plot(episode, axes)
+        lines += plot(episode, actuator, axes)
         _share_axis(axis, axes, label, end, window)
     content.axes[0].set_xticks([])
     narrow_legend = (
@@ -110,21 +110,21 @@ def draw_strip(
     return scale, _pixels(frame), _pixels(content)
 
 
-def _figure(width: int, height: int) -> Any:
+def _figure(width: int, height: int) -> Figure:
+    from matplotlib import figure as figures
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
+    figure = figures.Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
     FigureCanvasAgg(figure)
     return figure
 
 
-def _pixels(figure: Any) -> np.ndarray:
+def _pixels(figure: Figure) -> np.ndarray:
     figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
 
 
-def _share_axis(axis: Any, axes: Any, label: str, end: float, window: float) -> None:
+def _share_axis(axis: Axes, axes: Axes, label: str, end: float, window: float) -> None:
     """Move the vertical axis of `axes` to `axis`, and set about six time ticks per window."""
     from matplotlib.ticker import MaxNLocator, MultipleLocator
 
@@ -143,9 +143,9 @@ def _share_axis(axis: Any, axes: Any, label: str, end: float, window: float) -> 
     axes.xaxis.set_major_formatter(lambda time, _: f"{time:g} s" if time else "")
 
 
-def _plot_torque(episode: Episode, axes: Any) -> list[Any]:
+def _plot_torque(episode: Episode, actuator: ActuatorModel, axes: Axes) -> list[Artist]:
     """Plot desired and actual torque (force, if there is no motor), and shade reached limits."""
-    arm, edges = episode.actuator.arm_radius, np.append(0.0, episode.time)
+    arm, edges = actuator.arm_radius, np.append(0.0, episode.time)
     desired, actual = episode.signals["desired_force"] * arm, episode.signals["actual_force"] * arm
     limit = 1.15 * max(np.abs(desired).max(), np.abs(actual).max(), 1e-9)
     axes.set_ylim(-limit, limit)
@@ -158,9 +158,7 @@ def _plot_torque(episode: Episode, axes: Any) -> list[Any]:
         )
         if label == "actual" or all(episode.is_torque_controlled)
     ]
-    limits = [name for name in _LIMIT_COLORS if name in episode.actuator.Signals._fields] or [
-        "saturated"
-    ]
+    limits = [name for name in _LIMIT_COLORS if name in actuator.Signals._fields] or ["saturated"]
     for name in limits:
         is_limited = episode.signals[name] != 0.0
         if is_limited.any():
@@ -190,16 +188,15 @@ def _second_signal(actuator: ActuatorModel) -> tuple[str | None, str]:
 
     The signal is the voltage, or the family's first signal with a unit, or None.
     """
-    fields: tuple[str, ...] = actuator.Signals._fields  # type: ignore[attr-defined]
+    fields: tuple[str, ...] = actuator.Signals._fields
     if "voltage" in fields or isinstance(actuator, Ideal):
         return None if isinstance(actuator, Ideal) else "voltage", "u [V]"
     name = next((name for name in actuator.SIGNAL_UNITS if name in fields), None)
     return name, f"{name} [{actuator.SIGNAL_UNITS[name]}]" if name else ""
 
 
-def _plot_signal(episode: Episode, axes: Any) -> list[Any]:
+def _plot_signal(episode: Episode, actuator: ActuatorModel, axes: Axes) -> list[Artist]:
     """Plot the voltage with its limit if that is near, or the first signal of other families."""
-    actuator = episode.actuator
     name, _ = _second_signal(actuator)
     if name is None:
         axes.set_ylim(-1, 1)

@@ -3,10 +3,10 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
+from codrl_mj.boundary import Json
 from codrl_mj.runs.files import atomic_write, check_writable
 from codrl_mj.validation.certificate import GROUPS, Certificate, verdict, versions
 from codrl_mj.validation.mutations import MutationResult, as_mapping, undetected_checks
@@ -127,7 +127,7 @@ def _mutations(certificate: Certificate, results: Sequence[MutationResult]) -> p
     return page.Section("mutations", "Mutations", page.join(body))
 
 
-def summary(content: Mapping[str, Any]) -> Markup:
+def summary(content: Mapping[str, Json]) -> Markup:
     """Return a summary of a `certificate.json` as markup."""
     checks = content["checks"]
     rows = []

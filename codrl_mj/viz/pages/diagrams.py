@@ -3,9 +3,10 @@
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from codrl_mj.actuators import (
     ActuatorModel,
@@ -17,6 +18,10 @@ from codrl_mj.actuators import (
     TorqueSpeed,
     parameters_type,
 )
+from codrl_mj.actuators.model import FamilyTuple
+from codrl_mj.catalogue import MotorParameters
+from codrl_mj.evaluation.evaluate import MotorTrace
+from codrl_mj.plots import Curve, CurveOwner, CurveStyle, Plot
 from codrl_mj.sizing import (
     CurrentLoopActuator,
     LoopAnalysis,
@@ -29,7 +34,6 @@ from codrl_mj.sizing import (
 )
 from codrl_mj.sizing.limits import diagram_limits, highest_current, torque_limits
 from codrl_mj.sizing.loop import StepResponses
-from codrl_mj.viz.pages.plots import Curve, Plot
 
 TORQUE_SPEED = "speed of the output [rad/s]", "torque of the output [N·m]"
 """Axes of a torque-speed diagram."""
@@ -40,14 +44,66 @@ Loops = Mapping[str, tuple[CurrentLoopActuator, float | None]]
 """Name of a current loop -> the loop, and the mechanical step [s] if it is not a drive's."""
 
 
-def torque_speed_diagram(drive: Drive, numbers: Any = None, points: Any = None) -> Plot:
+@dataclasses.dataclass(frozen=True)
+class MotorSeries(MotorTrace):
+    """Signals of one motor of one run, with the style of their curves."""
+
+    label_prefix: str
+    """Prefix of the curves' labels."""
+    color_index: int | None
+    """Index of the motor among those of all runs, for its color; None for a single motor."""
+    tags: tuple[str, ...]
+    """Owners of the curves: the run and the motor."""
+    stride: int
+    """Number of integration steps per drawn point."""
+
+    @property
+    def turning(self) -> np.ndarray:
+        """Velocity of the shaft at the end of each integration step [rad/s]."""
+        return self.speed[1:] / self.actuator.arm_radius
+
+    def has(self, *names: str) -> bool:
+        """Return True if the motor's family has these signals."""
+        return not isinstance(self.actuator, Ideal) and set(names) <= self.signals.keys()
+
+    def curve(
+        self, label: str, values: np.ndarray, color: int, held: bool = True, dashed: bool = False
+    ) -> Curve:
+        """Return a curve over the integration steps.
+
+        Values that are `held` apply from the start of each step, others at its end.
+        """
+        selection = slice(None, None, self.stride)
+        values = np.asarray(values, dtype=float)
+        time = self.timestep * (np.arange(len(values)) + (not held))
+        # A held value needs the end of the last step too, to be drawn over its whole length.
+        if held:
+            time = np.append(time[selection], time[-1] + self.timestep)
+            values = np.append(values[selection], values[-1])
+        else:
+            time, values = time[selection], values[selection]
+        return Curve(
+            self.label_prefix + label,
+            time,
+            values,
+            style="step" if held else "line",
+            colour=color,
+            shared=self.color_index,
+            dashed=dashed,
+            tags=self.tags,
+        )
+
+
+def torque_speed_diagram(
+    drive: Drive, numbers: MotorParameters | None = None, points: ArrayLike | None = None
+) -> Plot:
     """Return the torque that a drive can deliver at its output in all quadrants, minus friction.
 
     See `torque_limits`.
 
     Args:
         drive: drive whose voltage, `max_current`, gear and friction are drawn.
-        numbers: `codrl_mj.catalogue.MotorParameters`, for the continuous current; None if
+        numbers: numbers of the motor, for the continuous current; None if
             it is unknown.
         points: operating points to draw too, shape (n, 2): speed [rad/s] and torque [N*m] of the
             output.
@@ -115,7 +171,7 @@ def envelope(
     speeds: np.ndarray,
     torques: tuple[np.ndarray, np.ndarray],
     filled: bool = True,
-    **style: Any,
+    **style: Unpack[CurveStyle],
 ) -> list[Curve]:
     """Return the curves of the lowest and highest torque [N*m] over speeds [rad/s]."""
     lowest, highest = labels
@@ -125,11 +181,8 @@ def envelope(
     ]
 
 
-def episode_diagram(lines: Sequence[Any]) -> Plot | None:
-    """Return the torque-speed points of episodes within the limits of their motors.
-
-    The lines are `episode._MotorSeries`.
-    """
+def episode_diagram(lines: Sequence[MotorSeries]) -> Plot | None:
+    """Return the torque-speed points of episodes within the limits of their motors."""
     curves: list[Curve] = []
     highest = 0.0
     motor_lines = [line for line in lines if not isinstance(line.actuator, Ideal)]
@@ -151,7 +204,7 @@ def episode_diagram(lines: Sequence[Any]) -> Plot | None:
             highest,
             min(3.0 * max_torque, 1.1 * float(np.abs(torques[1]).max()) if torques else max_torque),
         )
-        owner: Any = {"shared": line.color_index, "tags": line.tags}
+        owner: CurveOwner = {"shared": line.color_index, "tags": line.tags}
         if torques is not None:
             labels = f"{line.label_prefix}lowest possible", f"{line.label_prefix}highest possible"
             curves += envelope(labels, grid, torques, colour=0, dashed=True, **owner)
@@ -173,7 +226,9 @@ def episode_diagram(lines: Sequence[Any]) -> Plot | None:
     return Plot(title, *TORQUE_SPEED, tuple(curves), y_limit=highest)
 
 
-def torque_range(actuator: Any, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def torque_range(
+    actuator: ActuatorModel, speeds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the lowest and highest torque [N*m] of an actuator at speeds [rad/s], or None.
 
     None means that there are no such limits. The friction of the joint is part of the model and is
@@ -218,7 +273,7 @@ def torque_range(actuator: Any, speeds: np.ndarray) -> tuple[np.ndarray, np.ndar
     return None
 
 
-def no_load_speed(actuator: Any) -> float:
+def no_load_speed(actuator: ActuatorModel) -> float:
     """Return the speed without torque, before friction [rad/s]; infinite if it is unknown."""
     if isinstance(actuator, TorqueSpeed):
         return float(actuator.no_load_speed)
@@ -262,7 +317,7 @@ def bode_plots(loops: Loops, designed: Mapping[str, LoopAnalysis]) -> list[Plot]
             ("closed loop", closed_loop, False),
         ):
             values = function(*loop)(np.exp(2j * math.pi * frequencies / loop_design.sample_rate))
-            style: dict[str, Any] = {
+            style: CurveStyle = {
                 "colour": index if len(loops) > 1 else int(not dashed),
                 "dashed": dashed,
             }
@@ -415,7 +470,7 @@ def torque_step_plot(steps: Mapping[str, tuple[ActuatorModel, float, float]]) ->
     """
     curves = []
     for name, (actuator, desired, timestep) in steps.items():
-        kind: Any = type(actuator)
+        kind = type(actuator)
         if (
             not actuator.is_torque_controlled
             or actuator.MOTION
@@ -424,7 +479,7 @@ def torque_step_plot(steps: Mapping[str, tuple[ActuatorModel, float, float]]) ->
         ):
             continue
         parameters = parameters_type(kind)(*actuator.parameter_values)
-        state = kind.State(*[0.0] * len(kind.State._fields))
+        state: FamilyTuple = kind.State._make([0.0] * len(kind.State._fields))
         share = [0.0]
         for tick in range(100):
             inputs = Inputs(desired, 0.0, 0.0, tick * timestep, 0.0)

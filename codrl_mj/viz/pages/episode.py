@@ -1,21 +1,23 @@
 """One episode of each of several runs: films and plots on one clock."""
 
-import dataclasses
 import itertools
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
 
 from codrl_mj.actuators import Ideal
-from codrl_mj.evaluation import run_episodes
-from codrl_mj.evaluation.evaluate import MotorTrace, motor_traces
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation import Episode, run_episodes
+from codrl_mj.evaluation.evaluate import motor_traces
+from codrl_mj.plots import MAX_POINTS, Curve, CurveOwner, CurveStyle, Plot, Shade, flagged_intervals
+from codrl_mj.runs.policies import Policy
+from codrl_mj.runs.summaries import RunSummary
 from codrl_mj.viz.films.film import Clip, clip, record
 from codrl_mj.viz.pages import page
-from codrl_mj.viz.pages.diagrams import episode_diagram
-from codrl_mj.viz.pages.plots import MAX_POINTS, Curve, Plot, Shade, flagged_intervals
+from codrl_mj.viz.pages.diagrams import MotorSeries, episode_diagram
 from codrl_mj.viz.scene import state_names
 
 _SIZE = 480, 360
@@ -32,10 +34,10 @@ class RunEpisode(NamedTuple):
 
     name: str
     """Name of the run."""
-    env: Any
-    """`EnvConfig` of the run; None if it cannot be read."""
-    episode: Any
-    """Recorded `Episode`; None if there is a problem."""
+    env: EnvConfig | None
+    """Environment of the run; None if it cannot be read."""
+    episode: Episode | None
+    """Recorded episode; None if there is a problem."""
     film: Clip | None
     """Film of the scene; None if there is a problem."""
     problem: str | None
@@ -44,13 +46,33 @@ class RunEpisode(NamedTuple):
     """Seed of the episode."""
     best: bool = False
     """True if the policy is that of the best evaluation."""
-    summary: Any = None
-    """`RunSummary` of the run folder."""
+    summary: RunSummary | None = None
+    """Summary of the run folder."""
     rank: str = ""
     """Comparison of the episode's return with the run's evaluation."""
 
+    @property
+    def known_env(self) -> EnvConfig:
+        """Environment of a run whose environment can be read."""
+        assert self.env is not None
+        return self.env
 
-def run_and_film(name: str, env: Any, policy: Any, seed: int, with_film: bool = True) -> RunEpisode:
+    @property
+    def known_episode(self) -> Episode:
+        """Episode of a run that has one."""
+        assert self.episode is not None
+        return self.episode
+
+    @property
+    def known_summary(self) -> RunSummary:
+        """Summary of a run that was read from its folder."""
+        assert self.summary is not None
+        return self.summary
+
+
+def run_and_film(
+    name: str, env: EnvConfig, policy: Policy, seed: int, with_film: bool = True
+) -> RunEpisode:
     """Run an episode in a run's environment, an `EnvConfig`, and film it if possible."""
     episode, film, problem = None, None, None if with_film else "not requested"
     if with_film:
@@ -69,55 +91,6 @@ def run_and_film(name: str, env: Any, policy: Any, seed: int, with_film: bool = 
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class _MotorSeries(MotorTrace):
-    """Signals of one motor of one run, with the style of their curves."""
-
-    label_prefix: str
-    """Prefix of the curves' labels."""
-    color_index: int | None
-    """Index of the motor among those of all runs, for its color; None for a single motor."""
-    tags: tuple[str, ...]
-    """Owners of the curves: the run and the motor."""
-    stride: int
-    """Number of integration steps per drawn point."""
-
-    @property
-    def turning(self) -> np.ndarray:
-        """Velocity of the shaft at the end of each integration step [rad/s]."""
-        return self.speed[1:] / self.actuator.arm_radius
-
-    def has(self, *names: str) -> bool:
-        """Return True if the motor's family has these signals."""
-        return not isinstance(self.actuator, Ideal) and set(names) <= self.signals.keys()
-
-    def curve(
-        self, label: str, values: np.ndarray, color: int, held: bool = True, dashed: bool = False
-    ) -> Curve:
-        """Return a curve over the integration steps.
-
-        Values that are `held` apply from the start of each step, others at its end.
-        """
-        selection = slice(None, None, self.stride)
-        values = np.asarray(values, dtype=float)
-        time = self.timestep * (np.arange(len(values)) + (not held))
-        # A held value needs the end of the last step too, to be drawn over its whole length.
-        if held:
-            time = np.append(time[selection], time[-1] + self.timestep)
-            values = np.append(values[selection], values[-1])
-        else:
-            time, values = time[selection], values[selection]
-        style: Any = {"style": "step" if held else "line", "colour": color, "dashed": dashed}
-        return Curve(
-            self.label_prefix + label,
-            time,
-            values,
-            shared=self.color_index,
-            tags=self.tags,
-            **style,
-        )
-
-
 def episode_section(runs: Sequence[RunEpisode], extra_parts: Iterable[Markup] = ()) -> Markup:
     """Return films, controls and plots of episodes side by side.
 
@@ -125,9 +98,12 @@ def episode_section(runs: Sequence[RunEpisode], extra_parts: Iterable[Markup] = 
         runs: the runs with their episodes.
         extra_parts: further parts on the same clock (`page.clocked_part`).
     """
-    motors = list(dict.fromkeys(name for run in runs for name in run.episode.motors or ("motor",)))
+    episodes = [run.known_episode for run in runs]
+    motors = list(
+        dict.fromkeys(name for episode in episodes for name in episode.motors or ("motor",))
+    )
     series = _motor_series(runs, motors)
-    end = max(float(run.episode.time[-1]) for run in runs)
+    end = max(float(episode.time[-1]) for episode in episodes)
     films = [
         page.render_part("film", _caption(run, len(runs) > 1), *run.film)
         for run in runs
@@ -154,7 +130,9 @@ def episode_section(runs: Sequence[RunEpisode], extra_parts: Iterable[Markup] = 
         Markup('<div class="pinned">{}{}</div>').format(
             Markup('<div class="films">{}</div>').format(page.join(films)) if films else "",
             page.render_part(
-                "transport", f"{end:.6g}", f"{min(float(run.episode.time[0]) for run in runs):.6g}"
+                "transport",
+                f"{end:.6g}",
+                f"{min(float(episode.time[0]) for episode in episodes):.6g}",
             ),
         ),
         Markup('<div class="selectors">{}</div>').format(page.join(selectors))
@@ -186,7 +164,7 @@ def episode_section(runs: Sequence[RunEpisode], extra_parts: Iterable[Markup] = 
 
 
 def _caption(run: RunEpisode, with_name: bool) -> str:
-    episode = run.episode
+    episode = run.known_episode
     ending = f"{'ended' if episode.terminated else 'time limit'} at {episode.time[-1]:.2f} s"
     caption = (
         f"{run.name + ': ' if with_name else ''}seed {run.seed},"
@@ -195,7 +173,7 @@ def _caption(run: RunEpisode, with_name: bool) -> str:
     return f"{caption}; {run.rank}" if run.rank else caption
 
 
-def _motor_series(runs: Sequence[RunEpisode], motors: list[str]) -> list[_MotorSeries]:
+def _motor_series(runs: Sequence[RunEpisode], motors: list[str]) -> list[MotorSeries]:
     """Return the series of every motor of every run.
 
     Args:
@@ -205,20 +183,20 @@ def _motor_series(runs: Sequence[RunEpisode], motors: list[str]) -> list[_MotorS
     pairs = [
         (run, motor_index, motor)
         for run in runs
-        for motor_index, motor in enumerate(motor_traces(run.episode))
+        for motor_index, motor in enumerate(motor_traces(run.known_episode))
     ]
     max_points = max(MAX_POINTS // 4, _MAX_EPISODE_POINTS // (10 * len(pairs)))
     # Both the points of each curve and those of the page are limited. All motors share a stride, so
     # that their points are at the same times.
-    stride = max(-(-len(run.episode.trace["speed"]) // max_points) for run in runs)
+    stride = max(-(-len(run.known_episode.trace["speed"]) // max_points) for run in runs)
     series = []
     for index, (run, motor_index, motor) in enumerate(pairs):
-        names = run.episode.motors or ("motor",)
+        names = run.known_episode.motors or ("motor",)
         prefix_parts = [run.name] * (len(runs) > 1) + [names[motor_index]] * (len(names) > 1)
         tags = f"run:{runs.index(run)}", f"motor:{motors.index(names[motor_index])}"
         prefix = f"{', '.join(prefix_parts)}: " if prefix_parts else ""
         series.append(
-            _MotorSeries(
+            MotorSeries(
                 **vars(motor),
                 label_prefix=prefix,
                 color_index=index if len(pairs) > 1 else None,
@@ -232,7 +210,7 @@ def _motor_series(runs: Sequence[RunEpisode], motors: list[str]) -> list[_MotorS
 _TIME = "time [s]"
 
 
-def _motor_plots(lines: Sequence[_MotorSeries]) -> list[Plot]:
+def _motor_plots(lines: Sequence[MotorSeries]) -> list[Plot]:
     """Return the plots of torque, current, voltage, power and temperature of the motors."""
     ideal = [isinstance(line.actuator, Ideal) for line in lines]
     is_force, unit = all(ideal), "torque [N·m]"
@@ -242,7 +220,7 @@ def _motor_plots(lines: Sequence[_MotorSeries]) -> list[Plot]:
             if is_force
             else "torque [N·m], of the ideal actuator force [N]"
         )
-    torque, error, current, voltage, power, temperature = ([] for _ in range(6))  # type: ignore[var-annotated]
+    torque, error, current, voltage, power, temperature = ([] for _ in range(6))
     for line in lines:
         torque.append(line.curve("actual", line.actual, 1))
         if line.is_torque_controlled:
@@ -309,7 +287,7 @@ def _motor_plots(lines: Sequence[_MotorSeries]) -> list[Plot]:
     return plots
 
 
-def _shades(lines: Sequence[_MotorSeries], *names: str) -> tuple[Shade, ...]:
+def _shades(lines: Sequence[MotorSeries], *names: str) -> tuple[Shade, ...]:
     """Return the intervals in which the limits with these names were reached."""
     shades = []
     for line, name in itertools.product(lines, names):
@@ -325,7 +303,7 @@ def _shades(lines: Sequence[_MotorSeries], *names: str) -> tuple[Shade, ...]:
     return tuple(shades)
 
 
-def _voltage_limits(lines: Sequence[_MotorSeries], voltage_curves: Sequence[Curve]) -> list[Curve]:
+def _voltage_limits(lines: Sequence[MotorSeries], voltage_curves: Sequence[Curve]) -> list[Curve]:
     """Return lines at the supply voltages that are near the curves.
 
     A limit far away would flatten the curves.
@@ -359,7 +337,7 @@ _PLOTTED_SIGNALS = (
 )
 
 
-def _other_signals(lines: Sequence[_MotorSeries]) -> list[Plot]:
+def _other_signals(lines: Sequence[MotorSeries]) -> list[Plot]:
     """Return plots of signals that only some families have."""
     names = dict.fromkeys(
         name for line in lines for name in line.signals if name not in _PLOTTED_SIGNALS
@@ -385,19 +363,25 @@ def _run_plots(runs: Sequence[RunEpisode]) -> list[Plot]:
     has_several = len(runs) > 1
     for run_index, run in enumerate(runs):
         prefix = f"{run.name}: " if has_several else ""
-        owner: Any = {"shared": run_index if has_several else None, "tags": (f"run:{run_index}",)}
-        time = np.concatenate([[0.0], run.episode.time])
+        owner: CurveOwner = {
+            "shared": run_index if has_several else None,
+            "tags": (f"run:{run_index}",),
+        }
+        time = np.concatenate([[0.0], run.known_episode.time])
         counts: dict[str, int] = {}
-        for index, name in enumerate(state_names(run.env)):
+        for index, name in enumerate(state_names(run.known_env)):
             unit = (re.search(r"\[(.*)\]", name) or [name, "1"])[1]
             count = counts[unit] = counts.get(unit, -1) + 1
             if count < _MAX_STATES:
-                style = {"colour": count, "dashed": has_several and count > 0, **owner}
+                style: CurveStyle = {"colour": count, "dashed": has_several and count > 0, **owner}
                 curve = Curve(
-                    prefix + name.partition(" [")[0], time, run.episode.state[:, index], **style
+                    prefix + name.partition(" [")[0],
+                    time,
+                    run.known_episode.state[:, index],
+                    **style,
                 )
                 groups.setdefault(unit, []).append(curve)
-        held = np.append(run.episode.reward, run.episode.reward[-1])
+        held = np.append(run.known_episode.reward, run.known_episode.reward[-1])
         rewards.append(Curve(f"{prefix}reward", time, held, style="step", colour=5, **owner))
     for unit, curves in groups.items():
         names = list(

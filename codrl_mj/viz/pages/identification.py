@@ -10,8 +10,8 @@ from markupsafe import Markup
 from codrl_mj.identify.log import SIGNALS
 from codrl_mj.identify.result import USABLE, Identified, Trace
 from codrl_mj.identify.uncertainty import CAUSES
+from codrl_mj.plots import Curve, Plot
 from codrl_mj.viz.pages import page
-from codrl_mj.viz.pages.plots import Curve, Plot
 
 _MAX_LAGS = 400
 _STRONG_CORRELATION = 0.9

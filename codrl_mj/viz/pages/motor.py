@@ -1,9 +1,8 @@
 """Page of a motor: its numbers with their sources, its limits, and its current loop."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
@@ -17,6 +16,7 @@ from codrl_mj.sizing import (
     describe_unknown,
     step_responses,
 )
+from codrl_mj.sizing.limits import MotorReport, Quantity
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.diagrams import (
     Loops,
@@ -121,7 +121,7 @@ def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> 
     return page.write(out, page.page(name, "A motor", top, sections))
 
 
-def _values(caption: str, rows: Any) -> Markup:
+def _values(caption: str, rows: Iterable[Quantity]) -> Markup:
     cells = [
         (
             row["name"].replace("_", " "),
@@ -133,7 +133,7 @@ def _values(caption: str, rows: Any) -> Markup:
     return page.table(caption, ("number", "value", "unit"), cells, numbers=(1,))
 
 
-def _abilities(explanation: Mapping[str, Any], drive: Drive, entry: MotorEntry | None) -> Markup:
+def _abilities(explanation: MotorReport, drive: Drive, entry: MotorEntry | None) -> Markup:
     table = _values(
         f"At the output of the gear, friction subtracted, at {drive.voltage_limit:g} V",
         explanation["abilities"],
@@ -141,7 +141,9 @@ def _abilities(explanation: Mapping[str, Any], drive: Drive, entry: MotorEntry |
     if explanation["assumed"]:
         table += page.paragraph(f"{explanation['assumed']}.", "soft")
     try:
-        plots = page.plots([torque_speed_diagram(drive, entry and entry.parameters)])
+        plots = page.plots(
+            [torque_speed_diagram(drive, None if entry is None else entry.parameters)]
+        )
     except ValueError as error:
         plots = page.note(str(error))
     return Markup('<div class="beside">{}{}</div>').format(plots, table)
@@ -182,7 +184,7 @@ def _loop(name: str, drive: Drive) -> Markup:
     )
 
 
-def _numbers(explanation: Mapping[str, Any]) -> Markup:
+def _numbers(explanation: MotorReport) -> Markup:
     """Return every number of a datasheet with its source."""
     if "numbers" not in explanation:
         return Markup()

@@ -9,14 +9,15 @@ import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jinja2
 from markupsafe import Markup
 
 from codrl_mj import __version__
+from codrl_mj.plots import Plot
 from codrl_mj.runs.files import atomic_write, check_page
-from codrl_mj.viz.pages.plots import Plot, describe, to_json, to_svg
+from codrl_mj.viz.pages.plots import describe, to_json, to_svg
 
 _HERE = Path(__file__).parent
 _POLICY = (
@@ -33,24 +34,24 @@ class Section(NamedTuple):
     id: str
     title: str
     body: Markup
-    mark: Any = ""
+    mark: str = ""
     """Markup beside the section's entry in the contents."""
 
 
 @functools.cache
 def _template(name: str) -> jinja2.Template:
-    options: Any = {
-        "autoescape": True,
-        "undefined": jinja2.StrictUndefined,
-        "trim_blocks": True,
-        "lstrip_blocks": True,
-    }
-    templates = jinja2.Environment(loader=jinja2.FileSystemLoader(_HERE), **options)
+    templates = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_HERE),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     templates.filters["data"] = _data_url
     return templates.get_template(name)
 
 
-def render_part(name: str, *arguments: Any) -> Markup:
+def render_part(name: str, *arguments: object) -> Markup:
     """Render a macro of `parts.html.jinja`, where its arguments are documented."""
     return Markup(getattr(_template("parts.html.jinja").module, name)(*arguments))
 
@@ -95,39 +96,39 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def join(parts: Iterable[Any]) -> Markup:
+def join(parts: Iterable[str]) -> Markup:
     """Return parts one after the other; parts that are not markup are escaped."""
     return Markup().join(parts)
 
 
-def paragraph(text: Any, kind: str = "") -> Markup:
+def paragraph(text: object, kind: str = "") -> Markup:
     """Return a paragraph, with a CSS class."""
     return Markup('<p class="{}">{}</p>' if kind else "<p>{1}</p>").format(kind, text)
 
 
-def note(text: Any, bad: bool = False) -> Markup:
+def note(text: object, bad: bool = False) -> Markup:
     """Return a highlighted paragraph, for an error if `bad`."""
     return paragraph(text, "note bad" if bad else "note")
 
 
-def heading(text: Any) -> Markup:
+def heading(text: object) -> Markup:
     """Return a heading within a section."""
     return Markup("<h3>{}</h3>").format(text)
 
 
-def definitions(entries: Iterable[tuple[Any, Any]]) -> Markup:
+def definitions(entries: Iterable[tuple[object, object]]) -> Markup:
     """Return a definition list of names and their values."""
     return Markup("<dl>{}</dl>").format(
         join(Markup("<dt>{}</dt><dd>{}</dd>").format(*entry) for entry in entries)
     )
 
 
-def details(summary: Any, body: Markup) -> Markup:
+def details(summary: object, body: Markup) -> Markup:
     """Return a block that the reader can unfold."""
     return Markup("<details><summary>{}</summary>{}</details>").format(summary, body)
 
 
-def mark_verdict(good: bool, text: Any, element: str = "strong", kind: str = "") -> Markup:
+def mark_verdict(good: bool, text: object, element: str = "strong", kind: str = "") -> Markup:
     """Return a word or a paragraph marked as good or bad, by a sign as well as by color."""
     word, sign = ("good", "✓") if good else ("bad", "✗")
     return Markup('<{0} class="{1}">{2} {3}</{0}>').format(
@@ -137,8 +138,8 @@ def mark_verdict(good: bool, text: Any, element: str = "strong", kind: str = "")
 
 def table(
     caption: str,
-    columns: Sequence[Any],
-    rows: Iterable[Sequence[Any]],
+    columns: Sequence[object],
+    rows: Iterable[Sequence[object]],
     numbers: Iterable[int] = (),
     cards: bool = False,
     failed: Iterable[int] = (),
@@ -197,7 +198,7 @@ def format_unit(text: str) -> str:
     return text.replace("*", "·").replace("^2", "²").replace("ohm", "Ω").replace("degC", "°C")
 
 
-def format_number(value: Any, digits: int = 4) -> str:
+def format_number(value: object, digits: int = 4) -> str:
     """Return a number as text, with an interval if it has one; a dash for a missing value."""
     if isinstance(value, Mapping):
         middle, low, high = (

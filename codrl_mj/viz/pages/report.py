@@ -5,14 +5,15 @@ import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from codrl_mj.actuators import ActuatorModel, DCMotorActuator, Drive, Ideal
+from codrl_mj.boundary import Json
 from codrl_mj.evaluation import Episode
 from codrl_mj.evaluation.evaluate import MEASURES
+from codrl_mj.plots import Curve, Plot
 from codrl_mj.runs import BEST, EPISODES, PROGRESS, finished, unique_names
 from codrl_mj.runs.files import check_page, read_json
 from codrl_mj.runs.policies import load_policy
@@ -34,7 +35,6 @@ from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.diagrams import torque_step_plot
 from codrl_mj.viz.pages.episode import RunEpisode, episode_section, run_and_film
 from codrl_mj.viz.pages.motor import loop_section
-from codrl_mj.viz.pages.plots import Curve, Plot
 
 _MAX_LOOPS = 4
 
@@ -153,7 +153,7 @@ def _run_episode(
         on_part(f"{name}: episode")
         result = run_and_film(name, env, load_policy(policy, trust), seed, with_film)
         return result._replace(
-            best=best, summary=summary, rank=describe_rank(evaluation, result.episode.total)
+            best=best, summary=summary, rank=describe_rank(evaluation, result.known_episode.total)
         )
     # Third-party environments and actuators may raise any error. The report names it and shows the
     # rest.
@@ -168,28 +168,30 @@ def _top(runs: Sequence[RunEpisode], runs_with_episode: Sequence[RunEpisode]) ->
     paragraphs: list[Markup] = []
     for run in runs:
         text = (
-            Markup("<b>{}</b>: {}").format(run.name, _sentence(run.summary))
+            Markup("<b>{}</b>: {}").format(run.name, _sentence(run.known_summary))
             if len(runs) > 1
-            else _sentence(run.summary)
+            else _sentence(run.known_summary)
         )
         paragraphs.append(page.paragraph(text, "lead"))
-        if run.summary.state == "unfinished":
+        if run.known_summary.state == "unfinished":
             paragraphs.append(
                 page.note("The training is not finished. This report shows its results so far.")
             )
-        if run.summary.state == "damaged":
+        if run.known_summary.state == "damaged":
             paragraphs.append(
-                page.note(f"The run folder is damaged: {run.summary.problem}", bad=True)
+                page.note(f"The run folder is damaged: {run.known_summary.problem}", bad=True)
             )
     paragraphs += [
         page.paragraph(_task_summary(task), "soft")
-        for task in dict.fromkeys(run.summary.task for run in runs)
+        for task in dict.fromkeys(run.known_summary.task for run in runs)
         if task
     ]
     for run_episode in runs_with_episode:
         if run_episode.film is not None:
             picture = page.render_part(
-                "image", run_episode.film.still, f"{run_episode.env.task}: the scene of an episode"
+                "image",
+                run_episode.film.still,
+                f"{run_episode.known_env.task}: the scene of an episode",
             )
             return Markup('<div class="intro"><div>{}</div>{}</div>').format(
                 page.join(paragraphs), picture
@@ -240,7 +242,7 @@ def _learning(runs: Sequence[RunEpisode]) -> Markup:
     evaluations: list[Curve] = []
     errors: list[Curve] = []
     for index, run in enumerate(runs):
-        reports = read_progress(run.summary.path / PROGRESS, [])
+        reports = read_progress(run.known_summary.path / PROGRESS, [])
         columns = [
             [row.get(name, "nan") for row in reports]
             for name in ("steps", "evaluation_return", "torque_error")
@@ -251,7 +253,7 @@ def _learning(runs: Sequence[RunEpisode]) -> Markup:
         except ValueError:
             steps, evaluated, torque_errors = np.empty((3, 0))
         try:
-            episodes = read_episodes(run.summary.path / EPISODES)
+            episodes = read_episodes(run.known_summary.path / EPISODES)
         except (ValueError, OSError) as error:
             episodes = np.empty((0, 4))
             notes.append(page.note(f"No curve of {run.name}'s training episodes: {error}"))
@@ -283,17 +285,17 @@ def _learning(runs: Sequence[RunEpisode]) -> Markup:
 
 def _evaluation(runs: Sequence[RunEpisode]) -> Markup:
     """Return the measures of the evaluations, with their intervals."""
-    evaluated = [run for run in runs if run.summary.evaluation is not None]
+    evaluated = [run for run in runs if run.known_summary.evaluation is not None]
     notes = [
         page.note(
             f"{run.name} has no evaluation: its last policy is evaluated when the training ends."
         )
         for run in runs
-        if run.summary.evaluation is None
+        if run.known_summary.evaluation is None
     ]
     if not evaluated:
         return page.join(notes)
-    evaluations = [dict(run.summary.evaluation or {}) for run in evaluated]
+    evaluations = [dict(run.known_summary.evaluation or {}) for run in evaluated]
     episode_counts = " and ".join(
         dict.fromkeys(str(evaluation.get("episodes")) for evaluation in evaluations)
     )
@@ -334,7 +336,7 @@ def _evaluation(runs: Sequence[RunEpisode]) -> Markup:
     return page.join((*notes, Markup(template).format(table, plots), *folded))
 
 
-def _measures(caption: str, columns: Mapping[str, Mapping[str, Any]]) -> Markup:
+def _measures(caption: str, columns: Mapping[str, Mapping[str, Json]]) -> Markup:
     """Return a table with a row for each measure that at least one column has."""
     rows = []
     for name, field in MEASURES.items():
@@ -358,7 +360,7 @@ def replay_parts(runs: Sequence[RunEpisode]) -> list[Markup]:
 
     parts = [Markup("<script>{}</script>").format(Markup(library_script()))]
     for run in runs:
-        fragment = replay_html(motion_of_episode(run.episode, run.env), run.name)
+        fragment = replay_html(motion_of_episode(run.known_episode, run.known_env), run.name)
         parts.append(
             Markup("<figure>{}</figure>").format(
                 page.clocked_part(f"Replay: {run.name}", fragment, SCRIPT)
@@ -372,7 +374,7 @@ def _loop(runs: Sequence[RunEpisode]) -> Markup:
     loops: dict[str, tuple[CurrentLoopActuator, float | None]] = {}
     steps: dict[str, tuple[ActuatorModel, float, float]] = {}
     notes: dict[str, None] = {}
-    known_loops: list[Any] = []
+    known_loops: list[tuple[object, ...]] = []
     for run in runs:
         driven = run.env.actuators_by_name if run.env is not None else {}
         for motor, actuator in driven.items():
@@ -414,7 +416,7 @@ def _loop(runs: Sequence[RunEpisode]) -> Markup:
                 (actuator, timestep) != (known_actuator, step)
                 for known_actuator, _, step in steps.values()
             ):
-                steps[name] = actuator, _step_torque(actuator, run.episode), timestep
+                steps[name] = actuator, _step_torque(actuator, run.known_episode), timestep
     parts = [page.paragraph(text, "soft") for text in notes]
     if len(loops) > _MAX_LOOPS:
         omitted = ", ".join(list(loops)[_MAX_LOOPS:])
@@ -463,17 +465,19 @@ def _settings(runs: Sequence[RunEpisode]) -> Markup:
     """Return the settings that differ between the runs, and all settings of each run."""
     parts = []
     if len(runs) > 1:
-        differing = compare([run.summary for run in runs]).configuration
+        differing = compare([run.known_summary for run in runs]).configuration
         rows = [(name, *map(_setting_text, values)) for name, values in differing.items()]
         columns = ("setting", *(run.name for run in runs))
         parts.append(page.table("What differs between the runs", columns, rows, cards=True))
     for run in runs:
-        rows = [(name, _setting_text(value)) for name, value in run.summary.configuration.items()]
+        rows = [
+            (name, _setting_text(value)) for name, value in run.known_summary.configuration.items()
+        ]
         label = f"All settings of {run.name}"
         if rows:
             parts.append(page.details(label, page.table(label, ("setting", "value"), rows)))
     return page.join(parts)
 
 
-def _setting_text(value: Any) -> str:
+def _setting_text(value: object) -> str:
     return value if isinstance(value, str) else json.dumps(value)

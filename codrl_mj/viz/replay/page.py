@@ -4,13 +4,14 @@ import base64
 import dataclasses
 import html
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 
+from codrl_mj.boundary import Json
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.episodes import Episode
 from codrl_mj.runs.files import atomic_write, check_page
 from codrl_mj.viz.replay.scene import (
@@ -129,7 +130,7 @@ def motion(
     )
 
 
-def motion_of_episode(episode: Episode, env: Any) -> Motion:
+def motion_of_episode(episode: Episode, env: EnvConfig) -> Motion:
     """Return the motion of an episode that `codrl_mj.evaluation.run_episodes` recorded.
 
     Args:
@@ -206,7 +207,7 @@ def _read_text(name: str) -> str:
     return (_HERE / name).read_text(encoding="utf-8")
 
 
-def _content(motion: Motion) -> dict[str, Any]:
+def _content(motion: Motion) -> dict[str, Json]:
     """Return the data that the viewer reads; large arrays are base64."""
     body_index = {int(body): index for index, body in enumerate(motion.bodies)}
     meshes = list(dict.fromkeys(shape.mesh for shape in motion.shapes if shape.mesh is not None))
@@ -243,7 +244,7 @@ def _content(motion: Motion) -> dict[str, Any]:
     }
 
 
-def _meshes(model: mujoco.MjModel, mesh_ids: list[tuple[str, int]]) -> list[dict[str, Any]]:
+def _meshes(model: mujoco.MjModel, mesh_ids: list[tuple[str, int]]) -> list[dict[str, Json]]:
     """Return the meshes, with vertices on a 16-bit grid over the extent of each."""
     meshes = [read_mesh(model, *mesh_id) for mesh_id in mesh_ids]
     total = sum(len(triangles) for _, triangles in meshes)
@@ -273,5 +274,5 @@ def _to_base64(values: np.ndarray) -> str:
     return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()
 
 
-def _rounded(values: Any) -> list[float]:
+def _rounded(values: Iterable[float]) -> list[float]:
     return [float(f"{value:.7g}") for value in values]

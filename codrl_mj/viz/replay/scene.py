@@ -2,10 +2,11 @@
 
 import dataclasses
 from collections.abc import Collection
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 _MUJOCO_ELEVATION, _ELEVATION = -45.0, -20.0
 """Elevation of the free camera [degrees]: MuJoCo's default, and the value that replaces it.
@@ -98,7 +99,9 @@ def visible_shapes(model: mujoco.MjModel) -> list[Shape]:
     return shapes
 
 
-def _shape_color(model: mujoco.MjModel, rgba: Any, material: int) -> tuple[tuple[float, ...], bool]:
+def _shape_color(
+    model: mujoco.MjModel, rgba: ArrayLike, material: int
+) -> tuple[tuple[float, ...], bool]:
     """Return a shape's color, times the mean color of its texture, and True if it has a texture.
 
     The color is chosen as in MuJoCo.

@@ -4,13 +4,14 @@ import functools
 import itertools
 import queue
 import time
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Hashable, Iterable
 
 import numpy as np
 import trimesh
+import viser
 from viser import uplot
 
+from codrl_mj.actuators.parameters import FieldValue
 from codrl_mj.viz.replay.scene import (
     TRIANGLES,
     Shape,
@@ -42,6 +43,8 @@ _DELAY_STEPS = 5
 # End of the slider of an unlimited voltage [V].
 _MAX_SUPPLY = 48.0
 _FLAT_KINDS = ("box", "cylinder", "mesh", "plane")
+ChangeSetting = Callable[[tuple[str, ...], FieldValue], None]
+"""Function (path, value) that sets a field of the session's settings."""
 
 
 class Browser:
@@ -54,7 +57,7 @@ class Browser:
         """
         self.session = session
         self.playing, self._speed, self._budget, self._real_time_factor = True, 1.0, 0.0, 1.0
-        self._pending: queue.SimpleQueue[tuple[Any, Callable[[], None]]] = queue.SimpleQueue()
+        self._pending: queue.SimpleQueue[tuple[Hashable, Callable[[], None]]] = queue.SimpleQueue()
         self._refusal = ""
         self.server = LocalServer(port)
         self.server.gui.set_panel_label(title)
@@ -92,7 +95,7 @@ class Browser:
 
     def run_pending(self) -> None:
         """Execute the pending requests; of several requests for one field, only the last."""
-        requests: dict[Any, Callable[[], None]] = {}
+        requests: dict[Hashable, Callable[[], None]] = {}
         while not self._pending.empty():
             key, action = self._pending.get()
             requests.pop(key, None)
@@ -119,7 +122,7 @@ class Browser:
         cameras = [model.camera(index).name for index in range(model.ncam)]
         is_task = hasattr(self.session.env.unwrapped, "physics") and "fixed" in cameras
         view = initial_view(model, self._shapes, self._poses, moving, "fixed" if is_task else None)
-        self._frames: dict[int, Any] = {}
+        self._frames: dict[int, viser.FrameHandle] = {}
         meshes = {
             shape.mesh: simplify_mesh(*read_mesh(model, *shape.mesh), TRIANGLES // 4)
             for shape in self._shapes
@@ -296,8 +299,8 @@ class Browser:
 
     def _add_signal_plots(self) -> None:
         gui, session = self.server.gui, self.session
-        self._plots: list[tuple[list[int], Any]] = []
-        self._motor: Any = None
+        self._plots: list[tuple[list[int], viser.GuiUplotHandle]] = []
+        self._motor: viser.GuiDropdownHandle | None = None
         units: dict[str, str] = {
             "desired_force": "force, torque at the joint",
             "actual_force": "force, torque at the joint",
@@ -332,9 +335,7 @@ class Browser:
                     ([session.recorder.trace_names.index(name) for name in names], handle)
                 )
 
-    def _add_settings(
-        self, title: str, fields: Iterable[Control], change: Callable[[tuple[str, ...], Any], None]
-    ) -> None:
+    def _add_settings(self, title: str, fields: Iterable[Control], change: ChangeSetting) -> None:
         """Add a folder with sliders and, inside it, a folder with the numbers that are typed."""
         gui, fields = self.server.gui, list(fields)
         with_slider = [
@@ -351,10 +352,10 @@ class Browser:
                     for control in typed:
                         self._add_field(control, change)
 
-    def _add_field(self, control: Control, change: Callable[[tuple[str, ...], Any], None]) -> None:
+    def _add_field(self, control: Control, change: ChangeSetting) -> None:
         gui, hint = self.server.gui, control.about
         label = control.path[-1].replace("_", " ") + (f" [{control.unit}]" if control.unit else "")
-        handle: Any
+        handle: viser.GuiInputHandle
         if control.options:
             handle = gui.add_dropdown(
                 label, control.options, initial_value=control.value, hint=hint
@@ -382,7 +383,7 @@ class Browser:
 
     # -- requests of the clients ------------------------------------------------------------------
 
-    def _enqueue(self, key: Any, action: Callable[[], None]) -> None:
+    def _enqueue(self, key: Hashable, action: Callable[[], None]) -> None:
         """Schedule an action between two frames, because viser calls back from its own threads."""
         self._pending.put((key, action))
 

@@ -4,14 +4,16 @@ import contextlib
 import functools
 import http
 import io
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Awaitable, Callable, Iterator
 from urllib.parse import urlsplit
 
 import viser
 import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
+
+from codrl_mj.boundary import Argument
 
 HOST = "127.0.0.1"
 _HOST_NAMES = (HOST, "localhost")
@@ -63,8 +65,13 @@ def _check_requests() -> Iterator[None]:
     original = websockets.asyncio.server.serve
 
     @functools.wraps(original)
-    def serve(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
-        def check_request(connection: Any, request: Request) -> Response | None:
+    def serve(
+        handler: Callable[[ServerConnection], Awaitable[None]],
+        *arguments: Argument,
+        process_request: Argument = None,
+        **options: Argument,
+    ) -> websockets.asyncio.server.serve:
+        def check_request(connection: ServerConnection, request: Request) -> Response | None:
             if not is_same_origin(request.headers):
                 return Response(
                     http.HTTPStatus.FORBIDDEN, "Forbidden", Headers({"Content-Length": "0"}), b""
@@ -83,14 +90,14 @@ def _check_requests() -> Iterator[None]:
 
         return original(handler, *arguments, process_request=check_request, **options)
 
-    websockets.asyncio.server.serve = serve  # type: ignore[assignment,misc]
+    websockets.asyncio.server.serve = serve
     try:
         yield
     finally:
-        websockets.asyncio.server.serve = original  # type: ignore[misc]
+        websockets.asyncio.server.serve = original
 
 
-def is_same_origin(headers: Any) -> bool:
+def is_same_origin(headers: Headers) -> bool:
     """Return True if a request comes from this server's own page, or from no page at all."""
     host, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(host) != 1 or urlsplit(f"//{host[0]}").hostname not in _HOST_NAMES:

@@ -9,16 +9,20 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from types import MappingProxyType, SimpleNamespace
-from typing import Any
+from types import MappingProxyType
 
 import mujoco
 import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import override_actuator
+from codrl_mj.actuators.parameters import FieldValue
+from codrl_mj.boundary import Action
+from codrl_mj.envs.config import Env, EnvConfig
 from codrl_mj.evaluation import RandomPolicy, check_policy
-from codrl_mj.fields import field_docs, nested_types
+from codrl_mj.evaluation.episodes import Recorder
+from codrl_mj.fields import Checked, field_docs, nested_types
+from codrl_mj.runs.policies import Policy
 
 _NO_LIMIT = 10**9  # environment steps
 _DIVERGENCE_WARNINGS = (
@@ -40,7 +44,7 @@ class Control:
     """Names from the outermost part to the field."""
     unit: str
     """Unit; empty if there is none."""
-    value: Any
+    value: FieldValue
     """Current value; None if the field is not set."""
     low: float | None = None
     """Start of a number's slider: the bound, or a little above an excluded bound."""
@@ -54,9 +58,9 @@ class Control:
     @property
     def is_unlimited(self) -> bool:
         """True if the end of the slider stands for infinity."""
-        return self.value == math.inf
+        return bool(self.value == math.inf)
 
-    def from_slider(self, slider_value: Any) -> Any:
+    def from_slider(self, slider_value: FieldValue) -> FieldValue:
         """Return the field's value for a value of the slider."""
         if self.is_unlimited and self.high is not None and slider_value >= self.high:
             return math.inf
@@ -64,7 +68,7 @@ class Control:
 
 
 def controls(
-    settings: Any,
+    settings: Checked,
     scale: float | None = None,
     ends: Mapping[str, float] = MappingProxyType({}),
     path: tuple[str, ...] = (),
@@ -78,15 +82,19 @@ def controls(
         ends: field name -> end of its slider, for fields that are 0.
         path: names of the parts that lead to `settings`.
     """
-    kind: Any = type(settings)
-    result, nested, docs = [], nested_types(kind), field_docs(kind)
+    kind: type = type(settings)
+    result: list[Control] = []
+    nested, docs = nested_types(kind), field_docs(kind)
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
         field_path = (*path, field.name)
         documentation = docs.get(field.name)
         if field.name in nested:
             result += controls(
-                field.metadata.get("absent") if value is None else value, scale, ends, field_path
+                field.metadata.get("absent", value) if value is None else value,
+                scale,
+                ends,
+                field_path,
             )
         elif "options" in field.metadata:
             result.append(
@@ -136,7 +144,7 @@ class Session:
     """
 
     def __init__(
-        self, config: Any, policies: Mapping[str, Callable[[], Any]], seed: int = 0
+        self, config: EnvConfig, policies: Mapping[str, Callable[[], Policy]], seed: int = 0
     ) -> None:
         """Build the environment and start an episode.
 
@@ -156,16 +164,15 @@ class Session:
         """True to reset after an episode has ended or reached its time limit, False to go on."""
         self.signals: deque[tuple[float, np.ndarray]] = deque()
         """Time [s], and for each motor a row with the recorder's `trace_names`."""
-        self._seed, self._diverged, self._pushes = seed, False, {}  # type: ignore[var-annotated]
+        self._seed, self._diverged = seed, False
+        self._pushes: dict[int, tuple[float, np.ndarray]] = {}
         self.env = self._make_env()
-        self.policies = {
+        self.policies: dict[str, Callable[[], Policy]] = {
             **policies,
             "random": lambda: RandomPolicy(self.env.action_space, self._seed),
         }
         if (action := self._zero_action()) is not None:
-            zero_policy = SimpleNamespace(
-                predict=lambda observations, **_: (np.array([action] * len(observations)), None)
-            )
+            zero_policy = _ConstantPolicy(action)
             self.policies["zero"] = lambda: zero_policy
         self.choose(next(iter(self.policies)))
         self.reset()
@@ -175,12 +182,12 @@ class Session:
     @property
     def model(self) -> mujoco.MjModel:
         """Model of the environment."""
-        return self.env.unwrapped.model
+        return self.env.unwrapped.model  # type: ignore[attr-defined]
 
     @property
     def data(self) -> mujoco.MjData:
         """Simulation data, with the current poses."""
-        return self.env.unwrapped.data
+        return self.env.unwrapped.data  # type: ignore[attr-defined]
 
     @property
     def bodies(self) -> list[str]:
@@ -225,7 +232,9 @@ class Session:
         try:
             check_policy(policy, self.env)
             space = self.env.observation_space
-            action, _ = policy.predict(np.zeros((1, *space.shape), space.dtype), deterministic=True)
+            # Policies observe arrays, so the space has a shape.
+            zeros = np.zeros((1, *space.shape), space.dtype)  # type: ignore[misc]
+            action, _ = policy.predict(zeros, deterministic=True)
             fits = self.env.action_space.contains(
                 np.asarray(action[0], self.env.action_space.dtype)
             )
@@ -250,7 +259,7 @@ class Session:
         vector[axis] = force
         self._pushes[self.model.body(body).id] = (self.time + PUSH_DURATION, vector)
 
-    def set_actuator(self, pattern: str, path: tuple[str, ...], value: Any) -> None:
+    def set_actuator(self, pattern: str, path: tuple[str, ...], value: FieldValue) -> None:
         """Set a field of the actuator of a motor, or of all motors that match a pattern.
 
         The motion continues, and the motor's state is reset.
@@ -267,7 +276,7 @@ class Session:
             }
         )
 
-    def set_disturbance(self, path: tuple[str, ...], value: Any) -> None:
+    def set_disturbance(self, path: tuple[str, ...], value: FieldValue) -> None:
         """Set a field of the disturbances."""
         (name,) = path
         self._rebuild(
@@ -322,17 +331,17 @@ class Session:
 
     # -- internal ---------------------------------------------------------------------------------
 
-    def _make_env(self) -> Any:
-        env: Any = self.config.build()
+    def _make_env(self) -> Env:
+        env = self.config.build()
         if getattr(env.unwrapped, "model", None) is None:
             raise ValueError(
                 f"{self.config.task} has no MuJoCo model to show: physics must be mujoco, the"
                 " default"
             )
-        self.recorder: Any = env.get_wrapper_attr("recorder")
+        self.recorder: Recorder = env.get_wrapper_attr("recorder")
         return env
 
-    def _rebuild(self, make_changes: Callable[[], dict[str, Any]]) -> None:
+    def _rebuild(self, make_changes: Callable[[], dict[str, FieldValue]]) -> None:
         """Continue in an environment with other settings, or set `problem` if that fails."""
         positions, speeds = self.data.qpos.copy(), self.data.qvel.copy()
         # The old environment stays in use if the new one cannot be built.
@@ -363,7 +372,7 @@ class Session:
         else:
             physics.show(physics.state)
 
-    def _zero_action(self) -> Any:
+    def _zero_action(self) -> Action:
         """Return the action that causes no force; None if there is no such action."""
         space, setup = self.env.action_space, getattr(self.env.unwrapped, "setup", None)
         if isinstance(space, spaces.Box):
@@ -377,6 +386,23 @@ class Session:
             # three.
             return min_action if math.isclose(forces[min_action], 0.0, abs_tol=1e-12) else None
         return None
+
+
+class _ConstantPolicy:
+    """Policy that always takes the same action."""
+
+    def __init__(self, action: Action) -> None:
+        """Store the action."""
+        self._action = action
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        *,
+        deterministic: bool = False,  # noqa: ARG002 - required by the Policy protocol
+    ) -> tuple[np.ndarray, None]:
+        """Return the action for each observation."""
+        return np.array([self._action] * len(observation)), None
 
 
 def run_native(session: Session) -> None:

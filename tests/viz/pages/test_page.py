@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from markupsafe import Markup
 
+from codrl_mj.plots import Curve, Plot
 from codrl_mj.viz.pages import page
-from codrl_mj.viz.pages.plots import Curve, Plot
 from tests.viz.pages.parsed import check_self_contained
 
 EVIL = "<img src=http://there/x onerror='x()'> & \"y\""

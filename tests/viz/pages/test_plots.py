@@ -7,18 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from codrl_mj.viz.pages.plots import (
-    MAX_POINTS,
-    Curve,
-    Plot,
-    Shade,
-    decimate,
-    describe,
-    flagged_intervals,
-    save_png,
-    to_json,
-    to_svg,
-)
+from codrl_mj.plots import MAX_POINTS, Curve, Plot, Shade, decimate, flagged_intervals, save_png
+from codrl_mj.viz.pages.plots import describe, to_json, to_svg
 
 
 def read(plot):
