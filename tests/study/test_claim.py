@@ -1,5 +1,6 @@
 """The study of the paper's claim: its plan, and its verdicts on rows with known differences."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -9,8 +10,9 @@ import pytest
 import study_claim
 from codrl_mj.study.axes import FLOORS
 from codrl_mj.study.pages import read_csv, write_csv
+from codrl_mj.study.parallel import Workers
 from codrl_mj.study.questions import MARGIN
-from codrl_mj.study.trials import MEASURES, RUNS, format_ranges
+from codrl_mj.study.trials import MEASURES, RUNS, Grid, format_ranges
 from reproduction.arms import ARMS
 from study_claim import (
     FOLDER,
@@ -162,6 +164,18 @@ def test_published_rows_are_not_computed_again(study):
         "acrobot: ideal": "3",
         "acrobot: through": "3",
     }
+
+
+def test_one_job_publishes_each_training_and_goes_by_seed(study, monkeypatch):
+    parts = []
+    monkeypatch.setattr(Grid, "compute", lambda grid, *_, **__: parts.append(tuple(grid.cells)))
+    dataclasses.replace(study, workers=Workers(jobs=1)).run()
+    *single, whole = parts
+    assert single == [(cell,) for cell in whole]
+    assert whole == tuple(study.grid.cells)
+    seeds = [seed for _, seed in whole]
+    assert seeds == sorted(seeds)
+    assert {name.partition(":")[0] for name, seed in whole if seed == SEEDS - 1} == set(SETTINGS)
 
 
 def test_the_study_is_that_of_the_plan():
