@@ -1,21 +1,16 @@
 """The dm_control interface keeps dm_env's contract, and equals the Gymnasium environment."""
 
 import copy
-import itertools
-import pickle
 import re
-from unittest import TestCase
 
-import dm_env
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
 from dm_control.suite.wrappers import pixels
-from dm_env import specs, test_utils
 
 from codrl_mj import suite
-from codrl_mj.actuators import IDEAL, NAMED, CurrentLoop, DCMotorActuator, Motor
+from codrl_mj.actuators import IDEAL, CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import TASKS, named_actuator
@@ -24,50 +19,12 @@ from tests.engine.models import FULL, changed
 from tests.matrix import matrix_params
 from tests.tasks.faces import every_rebuilt
 
-VOLTAGES = (-12.0, -1.0, 0.0, 12.0)
 MOTOR = changed(FULL, inductance=0.2, max_voltage=20.0)
 
 every_task = pytest.mark.parametrize("task", TASKS)
 
 
-def _voltage(task):
-    discrete = isinstance(TASKS[task].action_space, gymnasium.spaces.Discrete)
-    return {"action": "voltage"} | ({"levels": VOLTAGES} if discrete else {})
-
-
-# -- dm_env's own contract ------------------------------------------------------------------------
-
-
-def _contract(domain, task_name, options):
-    """Return a test case of dm_env's contract, with actions beyond the end of an episode."""
-
-    class Contract(test_utils.EnvironmentTestMixin, TestCase):
-        def make_object_under_test(self):
-            config = EnvConfig(domain, max_episode_steps=30)
-            return suite.load(config, task_name, task_kwargs={"random": 0}, **options)
-
-        def make_action_sequence(self):
-            spec, generator = self.environment.action_spec(), np.random.default_rng(0)
-            for _ in range(35):
-                if isinstance(spec, specs.DiscreteArray):
-                    yield spec.dtype.type(generator.integers(spec.num_values))
-                else:
-                    yield generator.uniform(spec.minimum, spec.maximum).astype(spec.dtype)
-
-    return Contract
-
-
-for _domain, _task_name in suite.ALL_TASKS:
-    _kinds = {
-        name: {"actuator": name}
-        for name in (NAMED if TASKS[_domain].paper else ("ideal", "default"))
-    }
-    _kinds["observed"] = {"observe_actuator": True}
-    _kinds["voltage"] = _voltage(_domain)
-    _kinds["flat"] = {"environment_kwargs": {"flat_observation": True}}
-    for _kind, _options in _kinds.items():
-        _name = f"Test{_domain.title().replace('_', '')}{_kind.title().replace('_', '')}"
-        globals()[_name] = type(_name, (_contract(_domain, _task_name, _options),), {})
+# -- loading ---------------------------------------------------------------------------------------
 
 
 def test_all_tasks_are_listed():
@@ -98,6 +55,22 @@ def test_options_replace_those_of_a_configuration():
         suite.load(config, innersteps=2)
 
 
+@every_task
+def test_observations_have_names_or_are_a_single_vector(task):
+    options = {"observe_actuator": True, "task_kwargs": {"random": 5}}
+    named, flat = (
+        suite.load(task, environment_kwargs={"flat_observation": is_flat}, **options)
+        for is_flat in (False, True)
+    )
+    named_step, flat_step = named.reset(), flat.reset()
+    names = [*TASKS[task].observation_names, "current", "reference_current"]
+    assert [*named_step.observation] == [*named.observation_spec()] == names
+    assert [*flat_step.observation] == [*flat.observation_spec()] == ["observations"]
+    for action in _actions(named.action_space, 3, 0):
+        np.testing.assert_array_equal(flat_step.observation["observations"], _vector(named_step))
+        named_step, flat_step = named.step(action), flat.step(action)
+
+
 # -- the Gymnasium environment, bit for bit -------------------------------------------------------
 
 
@@ -109,60 +82,6 @@ def _actions(space, count, seed):
 
 def _vector(timestep):
     return np.concatenate(list(timestep.observation.values()))
-
-
-OPTIONS = {
-    "default": {},
-    "ideal": {"actuator": "ideal"},
-    "weak": {"actuator": "weak"},
-    "an actuator": {"actuator": MOTOR},
-    "a mapping": {"actuator": {"motor": {"inductance": 0.3}}},
-    "inner_steps": {"inner_steps": 20},
-    "timestep": {"timestep": 0.005},
-    "observed": {"observe_actuator": True},
-    "flat": {"observe_actuator": True, "environment_kwargs": {"flat_observation": True}},
-    "voltage": {"action": "voltage"},
-    "all": {"action": "voltage", "observe_actuator": True, "inner_steps": 25, "actuator": MOTOR},
-}
-CASES = [
-    *(
-        (task, OPTIONS[case])
-        for task, case in itertools.product(TASKS, OPTIONS)
-        if TASKS[task].paper or case != "weak"
-    ),
-    *(("cartpole", {"integrator": integrator}) for integrator in ("euler", "semi-implicit")),
-    ("cartpole", {"center_radius": 0.03, "actuator": "ideal"}),
-]
-
-
-@pytest.mark.parametrize(("task", "options"), CASES)
-def test_episodes_are_those_of_the_gymnasium_environment(task, options):
-    options = dict(options) | (_voltage(task) if "action" in options else {})
-    face_options = options.pop("environment_kwargs", {})
-    ours = suite.load(task, task_kwargs={"random": 5}, environment_kwargs=face_options, **options)
-    theirs = gymnasium.make(TASKS[task].env_id, disable_env_checker=True, **options)
-    first, (observation, _) = ours.reset(), theirs.reset(seed=5)
-    assert first.step_type is dm_env.StepType.FIRST
-    names = [*TASKS[task].observation_names, "current", "reference_current"]
-    names = names if options.get("observe_actuator") else names[:-2]
-    assert list(first.observation) == (["observations"] if face_options else names)
-    np.testing.assert_array_equal(_vector(first), observation)
-    rewards = set()
-    for action in _actions(theirs.action_space, 150, 0):
-        timestep = ours.step(action)
-        observation, reward, terminated, truncated, info = theirs.step(action)
-        np.testing.assert_array_equal(_vector(timestep), observation)
-        np.testing.assert_array_equal(ours.physics.data.qpos, theirs.unwrapped.data.qpos)
-        np.testing.assert_array_equal(ours.physics.data.act, theirs.unwrapped.data.act)
-        assert timestep.reward == reward
-        assert ours.info == info
-        assert timestep.last() == (terminated or truncated)
-        assert timestep.discount == (0.0 if terminated else 1.0)
-        rewards.add(reward)
-        # The next episode continues the random stream.
-        if timestep.last():
-            np.testing.assert_array_equal(_vector(ours.step(action)), theirs.reset()[0])
-    assert rewards == {0.0, 1.0} or "center_radius" not in options
 
 
 GOALS = {
@@ -243,24 +162,6 @@ def _run_actions(env, actions):
         ],
         float,
     )
-
-
-@every_task
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-@pytest.mark.parametrize(
-    "options", [{}, {"actuator": MOTOR, "observe_actuator": True, "inner_steps": 20}]
-)
-def test_a_copy_of_the_environment_continues_bit_for_bit(task, duplicate, options):
-    env = suite.load(task, task_kwargs={"random": 0}, **options)
-    env.reset()
-    first, *actions = _actions(env.action_space, 24, 1)
-    env.step(first)
-    before, twin = _complete_state(env.physics), duplicate(env)
-    assert twin.physics.data.ptr is twin.data is not env.data
-    np.testing.assert_array_equal(
-        [_complete_state(env.physics), _complete_state(twin.physics)], [before, before]
-    )
-    np.testing.assert_array_equal(_run_actions(twin, actions), _run_actions(env, actions))
 
 
 @every_task

@@ -14,9 +14,9 @@ from codrl_mj.envs import ActuatedEnv
 from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS
 from codrl_mj.user_code import asset_path
+from tests.conformance.environments import COMMAND_LIMITS, MOTOR, commanded
+from tests.conformance.episodes import assert_same, plain
 from tests.engine.models import changed
-from tests.envs.faces import COMMAND_LIMITS, MOTOR, commanded, plain
-from tests.envs.vectors import assert_same
 from tests.tasks.faces import every_rebuilt
 
 DISCRETE = ("cartpole", "acrobot", "mountain_car")

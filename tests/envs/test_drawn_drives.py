@@ -21,8 +21,8 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.validation.motor_catalogue import DriveOracle, JointOracle
-from tests.envs.faces import run
-from tests.envs.vectors import assert_equal_episodes, assert_same, batched, looped
+from tests.conformance.episodes import assert_same, run
+from tests.envs.vectors import assert_equal_episodes, batched, looped
 from tests.matrix import matrix_params
 from tests.tasks.faces import actions
 

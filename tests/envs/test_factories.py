@@ -11,8 +11,9 @@ from gymnasium.vector import AutoresetMode
 import codrl_mj
 from codrl_mj import EnvConfig, make, make_sb3_vec_env, make_vec, suite
 from codrl_mj.envs import ActuatedVectorEnv, SerialVectorEnv
-from tests.envs.faces import arguments
-from tests.envs.vectors import assert_equal_episodes, assert_same, looped, random_actions
+from tests.conformance.environments import arguments
+from tests.conformance.episodes import assert_same, random_actions
+from tests.envs.vectors import assert_equal_episodes, looped
 
 ID, COUNT = "codrl_mj/CartPole-v0", 2
 LIMITED = {"max_episode_steps": 4}
@@ -32,7 +33,7 @@ ARGUMENTS = {
     "rendered": {"render_mode": "rgb_array", "width": 64, "height": 48, "num_threads": 1},
     "options": {"options": {"center_radius": 0.01}},
     "option": {"center_radius": 0.01, "sutton_barto_reward": True},
-    "everything": arguments("cartpole", "everything"),
+    "everything": arguments("cartpole", "randomized"),
 }
 VECTORS = {
     "name": functools.partial(make_vec, "cartpole"),

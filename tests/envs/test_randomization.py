@@ -21,8 +21,9 @@ from codrl_mj.actuators.stability import spectral_radii, stability_radii
 from codrl_mj.engine.families import USER_HEADER_SIZE
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.tasks import named_actuator
-from tests.envs.faces import DRIVE, plain, scales
-from tests.envs.vectors import assert_same, batched
+from tests.conformance.environments import DRIVE, scales
+from tests.conformance.episodes import assert_same, plain
+from tests.envs.vectors import batched
 from tests.tasks.faces import actions, every_rebuilt, gymnasiums, random_states
 
 JOINT = {"pendulum": "hinge", "cartpole": "slider", "acrobot": "elbow"}

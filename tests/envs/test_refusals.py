@@ -13,8 +13,9 @@ from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Drive, GearMotor, M
 from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv
 from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS, named_actuator
-from tests.envs.faces import commanded
-from tests.envs.vectors import MODES, assert_same, batched, random_actions
+from tests.conformance.environments import commanded
+from tests.conformance.episodes import assert_same, random_actions
+from tests.envs.vectors import MODES, batched
 
 INF, NAN = math.inf, math.nan
 STABLE = DCMotorActuator(Motor(), CurrentLoop(kp=1.0))

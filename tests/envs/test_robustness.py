@@ -15,7 +15,8 @@ from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv
 from codrl_mj.physics import PHYSICS, SimulationDivergedError
 from codrl_mj.tasks import TASKS
 from tests.actuators.strategies import between, zero_or
-from tests.envs.vectors import MODES, assert_same, batched, random_actions
+from tests.conformance.episodes import assert_same, random_actions
+from tests.envs.vectors import MODES, batched
 from tests.matrix import matrix_params
 from tests.tasks.faces import REBUILT
 

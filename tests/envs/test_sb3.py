@@ -1,4 +1,4 @@
-"""The Stable-Baselines3 interface equals `DummyVecEnv` of `Monitor`s, bit for bit."""
+"""Agents, wrappers, attributes and refusals of the Stable-Baselines3 interface."""
 
 import gymnasium
 import numpy as np
@@ -12,11 +12,7 @@ import codrl_mj
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.tasks import TASKS
-from tests.envs.faces import PHYSICS, arguments, plain
-from tests.envs.vectors import assert_same, random_actions
-from tests.tasks.faces import every_rebuilt
-
-every_task = pytest.mark.parametrize("task", TASKS)
+from tests.conformance.episodes import random_actions
 
 
 def batched(task, num_envs, **arguments):
@@ -33,43 +29,11 @@ def looped(task, num_envs, **arguments):
 def sampled(env, steps, seed=0):
     """Return batches of actions within the bounds, as the algorithms of Stable-Baselines3 do."""
     generator = np.random.default_rng(seed)
-    batches = [random_actions(env.env, generator) for _ in range(steps)]
+    batches = [random_actions(env, generator) for _ in range(steps)]
     space = env.action_space
     return [
         batch if hasattr(space, "n") else np.clip(batch, space.low, space.high) for batch in batches
     ]
-
-
-@every_rebuilt
-@pytest.mark.parametrize("physics", PHYSICS)
-@pytest.mark.parametrize("setup", ["ideal", "force", "everything"])
-def test_steps_equal_those_of_dummy_vec_env(task, setup, physics):
-    options = arguments(task, setup, physics) | {"physics": physics, "max_episode_steps": 10}
-    ours, theirs = batched(task, 5, **options), looped(task, 5, **options)
-    assert ours.observation_space == theirs.observation_space
-    assert ours.action_space == theirs.action_space
-    for env in (ours, theirs):
-        env.seed(3)
-    ends = 0
-    # The reset in the middle restarts the records, from other states.
-    for seed in range(2):
-        assert_same(ours.reset(), theirs.reset())
-        assert ours.reset_infos == theirs.reset_infos
-        for actions in sampled(ours, 60, seed):
-            (*outcome, infos), (*expected, expected_infos) = (
-                ours.step(actions),
-                theirs.step(actions),
-            )
-            assert_same(tuple(outcome), tuple(expected))
-            for done, info, expected_info in zip(outcome[2], infos, expected_infos, strict=True):
-                if not done:
-                    assert info == {}
-                    continue
-                ends += 1
-                assert info["episode"]["t"] >= 0
-                assert_same(plain(info), plain({name: expected_info[name] for name in info}))
-                assert info.keys() == {"terminal_observation", "TimeLimit.truncated", "episode"}
-    assert ends >= 30
 
 
 @pytest.mark.parametrize("task", ["pendulum", "cartpole"])

@@ -3,17 +3,25 @@
 import numpy as np
 import pytest
 
-from codrl_mj import Uniform
+from codrl_mj import Uniform, make_sb3_vec_env, make_vec, suite
 from codrl_mj.envs import ActuatedEnv
-from tests.envs.faces import FACES, PHYSICS, arguments, run, start_episode
-from tests.envs.vectors import assert_same
+from tests.conformance.environments import COUNT, LIMITED, arguments
+from tests.conformance.episodes import assert_same, run, start_episode
+from tests.envs.vectors import batched
 from tests.tasks.faces import every_rebuilt
 
-both_physics = pytest.mark.parametrize("physics", PHYSICS)
+both_physics = pytest.mark.parametrize("physics", ["mujoco", "analytic"])
+INTERFACES = {
+    "single": ActuatedEnv,
+    "batch": lambda task, **options: batched(task, COUNT, **LIMITED, **options).unwrapped,
+    "serial": lambda task: make_vec(task, COUNT, physics="analytic", **LIMITED),
+    "sb3": lambda task: make_sb3_vec_env(task, COUNT, **LIMITED),
+    "dm_env": lambda task: suite.load(task, **LIMITED),
+}
 
 
-def _started_env(face="one", task="cartpole", **options):
-    env = FACES[face](task, **options)
+def _started_env(interface="single", task="cartpole", **options):
+    env = INTERFACES[interface](task, **options)
     start_episode(env, 0)
     return env
 
@@ -30,7 +38,7 @@ def test_a_minimal_environment_has_a_minimal_snapshot(physics):
 @both_physics
 def test_every_entry_of_a_snapshot_matters(physics):
     """Each entry of a snapshot has an effect on what follows."""
-    env = ActuatedEnv("pendulum", physics=physics, **arguments("pendulum", "everything", physics))
+    env = ActuatedEnv("pendulum", physics=physics, **arguments("pendulum", "randomized", physics))
     snapshots = []
     for seed in (0, 1):
         start_episode(env, seed)
@@ -50,7 +58,7 @@ def test_every_entry_of_a_snapshot_matters(physics):
 
 @every_rebuilt
 def test_the_model_is_restored_to_its_last_number(task):
-    env, other_env = (ActuatedEnv(task, **arguments(task, "everything")) for _ in range(2))
+    env, other_env = (ActuatedEnv(task, **arguments(task, "randomized")) for _ in range(2))
     start_episode(env, 5)
     start_episode(other_env, 99)
     other_env.restore(env.snapshot())
@@ -62,64 +70,68 @@ def test_the_model_is_restored_to_its_last_number(task):
 
 
 @pytest.mark.parametrize(
-    ("face", "options", "message"),
+    ("interface", "options", "message"),
     [
         (
-            "one",
+            "single",
             {"task": "acrobot"},
             r"\['task'\] is of shape \(7,\) and type uint8: must be of shape \(8,\)",
         ),
         (
-            "one",
+            "single",
             {"task": "pendulum"},
             r"\['physics'\] is of shape \(\d+,\) and type float64: must be of shape \(\d+,",
         ),
-        ("one", {"actuator": "ideal"}, r"\['physics'\] is of shape "),
-        ("one", {"physics": "analytic"}, r"\['physics'\] is of shape \(9,\) "),
+        ("single", {"actuator": "ideal"}, r"\['physics'\] is of shape "),
+        ("single", {"physics": "analytic"}, r"\['physics'\] is of shape \(9,\) "),
         (
-            "one",
+            "single",
             {"disturbances": {"command_delay": 0.1}},
             r"\['disturbances'\] is of shape .*: must be missing",
         ),
         (
-            "one",
+            "single",
             {"randomize": {"motor.inductance": Uniform(0.1, 0.2)}},
             r"\['drawn'\] is of shape \(1,\)",
         ),
-        ("many, NextStep", {"task": "pendulum"}, r"\['physics'\] is of shape "),
+        ("batch", {"task": "pendulum"}, r"\['physics'\] is of shape "),
     ],
 )
-def test_raises_for_a_snapshot_of_another_environment_and_changes_nothing(face, options, message):
-    env = _started_env(face)
+def test_raises_for_a_snapshot_of_another_environment_and_changes_nothing(
+    interface, options, message
+):
+    env = _started_env(interface)
     before = env.snapshot()
     with pytest.raises(ValueError, match=rf"^snapshot{message}"):
-        env.restore(_started_env(face, **options).snapshot())
+        env.restore(_started_env(interface, **options).snapshot())
     assert_same(env.snapshot(), before)
 
 
 @pytest.mark.parametrize(
-    ("face", "entry", "change", "message"),
+    ("interface", "entry", "change", "message"),
     [
         (
-            "one",
+            "single",
             "task",
             lambda _: np.frombuffer(b"pendulum", np.uint8),
             "of b'pendulum': must be of 'cartpole'",
         ),
-        ("one", "physics", np.float32, "of shape .* and type float32"),
-        ("one", "generator", None, r"missing: must be of shape \(6,\) and type uint64"),
-        ("many, NextStep", "physics", lambda rows: rows[:2], r"of shape \(2, \d+\)"),
-        ("many, NextStep", "elapsed", lambda rows: rows[:2], r"of shape \(2,\)"),
-        ("many, NextStep", "streams", None, "missing"),
-        ("serial, analytic", "physics", lambda rows: rows[:2], r"of shape \(2, \d+\)"),
-        ("Stable-Baselines3", "physics", lambda rows: rows[:2], r"of shape \(2, \d+\)"),
-        ("Stable-Baselines3", "lengths", None, "missing"),
-        ("dm_control", "physics", lambda row: row[:-1], "of shape"),
-        ("dm_control", "elapsed", None, "missing"),
+        ("single", "physics", np.float32, "of shape .* and type float32"),
+        ("single", "generator", None, r"missing: must be of shape \(6,\) and type uint64"),
+        ("batch", "physics", lambda rows: rows[:2], r"of shape \(2, \d+\)"),
+        ("batch", "elapsed", lambda rows: rows[:2], r"of shape \(2,\)"),
+        ("batch", "streams", None, "missing"),
+        ("serial", "physics", lambda rows: rows[:2], r"of shape \(2, \d+\)"),
+        ("sb3", "physics", lambda rows: rows[:2], r"of shape \(2, \d+\)"),
+        ("sb3", "lengths", None, "missing"),
+        ("dm_env", "physics", lambda row: row[:-1], "of shape"),
+        ("dm_env", "elapsed", None, "missing"),
     ],
 )
-def test_raises_for_a_snapshot_with_a_wrong_entry_and_changes_nothing(face, entry, change, message):
-    env = _started_env(face)
+def test_raises_for_a_snapshot_with_a_wrong_entry_and_changes_nothing(
+    interface, entry, change, message
+):
+    env = _started_env(interface)
     before = env.snapshot()
     incomplete = {name: value for name, value in before.items() if name != entry}
     with pytest.raises(ValueError, match=rf"^snapshot\['{entry}'\] is {message}"):

@@ -92,17 +92,6 @@ def test_raises_for_objects_that_are_no_source_and_for_unsupported_fields(call, 
         call()
 
 
-@pytest.mark.parametrize("env", [RigEnv, "tests.envs.rig:RigEnv", NAME, RIG])
-def test_a_class_its_name_and_a_source_make_the_same_environment(env):
-    config = EnvConfig(env, {"drive": "lag"}, max_episode_steps=3)
-    with config.build() as built, codrl_mj.make(RigEnv, {"drive": "lag"}) as expected:
-        np.testing.assert_array_equal(built.reset(seed=1)[0], expected.reset(seed=1)[0])
-        outcomes = [(built.step(np.ones(1)), expected.step(np.ones(1))) for _ in range(3)]
-        for ours, theirs in outcomes:
-            np.testing.assert_array_equal(ours[0], theirs[0])
-        assert [ours[3] for ours, _ in outcomes] == [False, False, True]
-
-
 def test_an_existing_folder_is_no_source_unless_it_has_the_name_of_a_task(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = ["pendulum", "swing-v2", "runs/swing-v2", "tests.envs.rig:RIG"]

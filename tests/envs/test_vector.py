@@ -1,26 +1,26 @@
 """The vector environment is Gymnasium's loop over single environments, bit for bit."""
 
 import copy
+import functools
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from codrl_mj import LogUniform, Uniform, make_sb3_vec_env
+from codrl_mj import LogUniform, Uniform, make_sb3_vec_env, make_vec
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator
-from codrl_mj.envs import ActuatedVectorEnv
+from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv, SerialVectorEnv
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.tasks import TASKS
+from codrl_mj.tasks import TASKS, named_actuator
+from tests.conformance.environments import DRIVE, scales
+from tests.conformance.episodes import assert_same, random_actions
 from tests.engine.models import FULL, changed
-from tests.envs.faces import DRIVE, SETUPS, arguments, scales
 from tests.envs.vectors import (
     MODES,
     assert_equal_episodes,
-    assert_same,
     batched,
     looped,
-    random_actions,
 )
 from tests.matrix import matrix_params
 from tests.tasks.faces import REBUILT, every_rebuilt
@@ -44,18 +44,6 @@ DIFFERENT = [
 
 
 # -- the same episodes ----------------------------------------------------------------------------
-
-
-@every_rebuilt
-@every_mode
-@pytest.mark.parametrize("setup", SETUPS)
-def test_episodes_are_those_of_single_environments(task, mode, setup):
-    options = arguments(task, setup) | {"max_episode_steps": 11}
-    ours = batched(task, 5, mode, num_threads=1 if mode == "SameStep" else 2, **options)
-    theirs = looped(task, 5, mode, **options)
-    assert ours.single_action_space == theirs.single_action_space
-    assert ours.single_observation_space == theirs.single_observation_space
-    assert (assert_equal_episodes(ours, theirs, 40).sum(axis=1) > 0).all()
 
 
 CURRENT = {"action": "current", "levels": (-1.5, 1.5)}
@@ -247,6 +235,33 @@ def test_without_a_limit_no_episode_is_truncated():
     env.reset(seed=0)
     actions = np.zeros((2, 1), np.float32)
     assert not any(end.any() for _ in range(1100) for end in env.step(actions)[2:4])
+
+
+def test_without_a_limit_no_serial_episode_is_truncated():
+    make = functools.partial(ActuatedEnv, "pendulum", physics="analytic")
+    env = SerialVectorEnv(2, make)
+    assert isinstance(env, gymnasium.vector.SyncVectorEnv)
+    env.reset(seed=0)
+    assert not any(env.step(np.zeros((2, 1), np.float32))[3].any() for _ in range(250))
+    assert env.task is TASKS["pendulum"]
+
+
+def test_each_serial_environment_can_have_an_actuator_of_its_own():
+    actuators = [named_actuator(name, "cartpole") for name in ("paper", "weak", "weaker")]
+    options = {"physics": "analytic", "randomize": {"motor.resistance": Uniform(1, 2)}}
+    env = make_vec("cartpole", 3, actuators, **options)
+    # Before the first reset all values are NaN, and there are no signals.
+    assert np.isnan(env.randomization["motor.resistance"]).all()
+    assert env.signals is None
+    env.reset(seed=3)
+    env.step(np.array([1, 1, 1]))
+    resistances = env.randomization["motor.resistance"]
+    assert len(set(resistances)) == 3
+    for row, actuator in enumerate(actuators):
+        single = ActuatedEnv("cartpole", actuator, **options)
+        drawn_values = single.reset(seed=3 + row)[1]["randomization"]
+        assert drawn_values["motor.resistance"] == resistances[row]
+        assert single.step(1)[4]["current"] == env.signals["current"][row]
 
 
 def test_gymnasiums_vector_wrappers_work_on_it():

@@ -12,9 +12,10 @@ import pytest
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS
+from tests.conformance.environments import commanded
 from tests.engine.models import FULL, changed
 from tests.reference import MotorSimulation
-from tests.tasks.faces import REBUILT, desired_force, every_rebuilt
+from tests.tasks.faces import REBUILT, actions, desired_force, every_rebuilt
 
 SPEED = {
     "pendulum": 1,
@@ -133,3 +134,30 @@ def test_the_pairs_saturate_at_times(task):
     voltages = np.abs(rows[:, TRACE.index("voltage")])
     assert (voltages == SUPPLY[task]).any()
     assert (voltages < SUPPLY[task]).any()
+
+
+@every_rebuilt
+@pytest.mark.parametrize("physics", ["mujoco", "analytic"])
+def test_a_motor_s_reference_current_is_that_of_the_desired_force(task, physics):
+    env = ActuatedEnv(task, physics=physics, **commanded(task, "force"))
+    env.reset(seed=0)
+    for action in actions(task, 0, 10):
+        info = env.step(action)[-1]
+        assert abs(info["desired_force"]) <= TASKS[task].max_force
+        # The arm is 0.5, the torque constant 0.8.
+        assert info["reference_current"] == pytest.approx(info["desired_force"] * 0.5 / 0.8)
+
+
+@every_rebuilt
+def test_mujoco_model_and_data_are_attributes_and_analytic_physics_raises(task):
+    env = ActuatedEnv(task)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    assert env.data.time == pytest.approx(env.task.step_duration)
+    assert env.model.opt.timestep == pytest.approx(
+        env.task.step_duration / env.task.motor_inner_steps
+    )
+    np.testing.assert_array_equal(env.state[list(env.task.qpos)], env.data.qpos)
+    np.testing.assert_array_equal(env.state[list(env.task.qvel)], env.data.qvel)
+    with pytest.raises(AttributeError, match="AnalyticPhysics has no MuJoCo model or data"):
+        _ = ActuatedEnv(task, physics="analytic").model

@@ -1,16 +1,14 @@
 """Comparison of the vector environment with Gymnasium's loop over single environments."""
 
-import functools
-
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 # The import registers the environments.
 import codrl_mj  # noqa: F401
-from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv, SerialVectorEnv
-from codrl_mj.envs.setup import configs_per_environment, task_config
+from codrl_mj.envs import ActuatedVectorEnv, SerialVectorEnv
 from codrl_mj.tasks import TASKS
+from tests.conformance.episodes import assert_same, random_actions
 
 MODES = tuple(mode.value for mode in AutoresetMode)
 
@@ -36,47 +34,6 @@ def looped(task, num_envs, mode="NextStep", **arguments):
         for actuator in actuators
     ]
     return SyncVectorEnv(env_functions, autoreset_mode=mode)
-
-
-def serial(num_envs, task, actuator=None, max_episode_steps=None, **arguments):
-    """Make a `SerialVectorEnv`; a list of actuators has one for each environment."""
-    config = task_config(task, None, arguments)
-    configs = configs_per_environment(config, num_envs, actuator)
-    env_functions = [functools.partial(ActuatedEnv, config) for config in configs]
-    return SerialVectorEnv(num_envs, env_functions, max_episode_steps)
-
-
-def assert_same(ours, theirs, path=""):
-    """Assert that nested results are equal bit for bit, including their types and shapes."""
-    if isinstance(theirs, dict):
-        assert isinstance(ours, dict), path
-        assert ours.keys() == theirs.keys(), path
-        for name in theirs:
-            assert_same(ours[name], theirs[name], f"{path}[{name!r}]")
-    elif isinstance(theirs, tuple):
-        assert len(ours) == len(theirs), path
-        for index, (item, expected_item) in enumerate(zip(ours, theirs, strict=True)):
-            assert_same(item, expected_item, f"{path}[{index}]")
-    elif theirs is None:
-        assert ours is None, path
-    else:
-        assert isinstance(ours, np.ndarray), path
-        assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape), path
-        if theirs.dtype == object:
-            for index, (item, expected_item) in enumerate(zip(ours, theirs, strict=True)):
-                assert_same(item, expected_item, f"{path}[{index}]")
-        else:
-            np.testing.assert_array_equal(ours, theirs, err_msg=path)
-
-
-def random_actions(env, generator):
-    """Return a batch of actions; continuous ones exceed the bounds by half."""
-    space = env.single_action_space
-    if isinstance(space, gymnasium.spaces.Discrete):
-        return generator.integers(space.n, size=env.num_envs)
-    return generator.uniform(
-        1.5 * space.low, 1.5 * space.high, (env.num_envs, *space.shape)
-    ).astype(np.float32)
 
 
 def assert_equal_episodes(ours, theirs, steps, seed=0, masks=True):

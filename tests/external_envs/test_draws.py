@@ -11,9 +11,10 @@ import pytest
 import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, Lag, SampledLoop, Servo, ServoLoop, Supply
 from codrl_mj.catalogue import motor_entry
+from tests.conformance.environments import CHEETAH, MAXON, NOISY
 from tests.external_envs.models import ARM, ArmEnv, actions, assert_same, run
-from tests.external_envs.test_gymnasium import CHEETAH, IDEAL, MAXON, NOISY
 
+IDEAL = {".*": "ideal"}
 # Third-party models have deprecated attributes.
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 DRAWS = {

@@ -1,26 +1,17 @@
 """`make`: Gymnasium's environments with motors."""
 
-import copy
 import functools
 import math
-import pickle
-import warnings
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
-from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv
-from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import codrl_mj
 from codrl_mj.actuators import (
-    CurrentLoop,
-    DCMotorActuator,
     Drive,
-    Motor,
     Servo,
     TorqueSpeed,
     VoltageDrive,
@@ -28,7 +19,7 @@ from codrl_mj.actuators import (
 from codrl_mj.catalogue import motor_entry
 from codrl_mj.engine.reading import motor_slots
 from codrl_mj.envs.config import EnvConfig
-from tests.add_motors.models import full_state
+from tests.conformance.environments import NOISY
 from tests.external_envs.models import ARM, V5, ArmEnv, BareEnv, actions, assert_same, run
 from tests.matrix import matrix_params
 
@@ -40,10 +31,6 @@ BACK, FRONT = ("bthigh", "bshin", "bfoot"), ("fthigh", "fshin", "ffoot")
 QUICK_IDS = ("HalfCheetah-v5", "InvertedPendulum-v5")
 every_v5 = pytest.mark.parametrize("env_id", matrix_params(QUICK_IDS, V5))
 CHEETAH, ARM_ID, BARE_ID = "HalfCheetah-v5", "ForeignArm-v0", "ForeignBare-v0"
-NOISY = DCMotorActuator(
-    Motor(resistance=1.0, inductance=0.05, torque_constant=0.8, back_emf_constant=0.01),
-    CurrentLoop(kp=0.5, ki=2.0, max_voltage=4.0, substeps=2, current_noise=0.1),
-)
 
 
 @pytest.fixture(autouse=True)
@@ -77,30 +64,6 @@ def test_ideal_motors_change_neither_episodes_nor_images(env_id):
     np.testing.assert_array_equal(*images)
 
 
-def _warnings_of(check, env, **options):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        check(env, **options)
-    messages = {str(warning.message).split("\n")[0] for warning in caught}
-    # One warning names the wrappers, which differ.
-    return {text for text in messages if "is different from the unwrapped version" not in text}
-
-
-@every_v5
-@pytest.mark.parametrize(
-    "check", [check_env, check_env_sb3], ids=["gymnasium", "stable_baselines3"]
-)
-def test_environment_checkers_warn_no_more_than_without_motors(env_id, check):
-    # Rendering in a window would need a display.
-    expected = _warnings_of(check, gym.make(env_id), skip_render_check=True)
-    for actuators, options in (
-        (IDEAL, {}),
-        ({".*": NOISY}, {"observe_actuator": True, "allow_unstable": True}),
-    ):
-        ours = codrl_mj.make(env_id, actuators, **options)
-        assert _warnings_of(check, ours, skip_render_check=True) <= expected
-
-
 def test_torque_stays_within_the_torque_speed_line():
     """Take one integration step per environment step, so that the speed for the line is known."""
     line = TorqueSpeed(stall_torque=0.64, no_load_speed=950.0, max_torque=0.38)
@@ -120,49 +83,6 @@ def test_torque_stays_within_the_torque_speed_line():
         saturated += info["saturated"]
     assert (saturated > 20).all()
     assert (saturated < 580).all()
-
-
-PULSES = {"pulse_force": 0.5, "pulse_duration": 0.03, "pulse_interval": 0.1}
-
-
-def _everything(env_id):
-    """Make an environment whose snapshot has noise, random values, delays and a time limit."""
-    draws = {
-        ".*": {
-            "motor.resistance": "uniform(0.5, 1.5)",
-            "motor.back_emf_constant": codrl_mj.Uniform(0.0, 0.02),
-        }
-    }
-    draws["model.gravity"] = "uniform(0.8, 1.2)"
-    return codrl_mj.make(
-        env_id,
-        {".*": NOISY},
-        observe_actuator=True,
-        randomize=draws,
-        disturbances={"command_delay": 0.07, "command_rate": 20.0} | PULSES,
-        allow_unstable=True,
-        max_episode_steps=40,
-    )
-
-
-# The rewards of Ant depend on poses that lag one step behind.
-@pytest.mark.parametrize("env_id", matrix_params((*QUICK_IDS, "Ant-v5"), V5))
-def test_a_snapshot_continues_bit_for_bit_in_a_fresh_environment(env_id):
-    env, other_env = _everything(env_id), _everything(env_id)
-    inputs = actions(env, 120)
-    run(env, inputs[:15], seed=5)
-    snapshot = env.snapshot()
-    expected = run(env, inputs[15:])
-    other_env.restore(snapshot)
-    rows = run(other_env, inputs[15:])
-    assert_same(rows, expected)
-    for ours, theirs in zip(rows, expected, strict=True):
-        assert ours[4].keys() == theirs[4].keys()
-    # The resets within the run must have drawn the same values, too.
-    assert sum(row[3] or row[2] for row in expected) >= 2
-    env.restore(snapshot)
-    assert_same(run(env, inputs[15:]), expected)
-    assert all(isinstance(array, np.ndarray) for array in snapshot.values())
 
 
 def test_raises_for_a_snapshot_of_another_environment():
@@ -191,21 +111,6 @@ def test_setting_the_state_brings_motors_to_rest():
     )
 
 
-@pytest.mark.parametrize(
-    ("env_id", "actuator"), [(CHEETAH, NOISY), (CHEETAH, "lag"), (BARE_ID, "lag")]
-)
-def test_resets_bring_motors_to_rest(env_id, actuator):
-    """Check that the engine's state, with motors, after a seed does not depend on the past."""
-    env = codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True)
-    inputs, states, runs = actions(env, 50), [], []
-    for length in (5, 50):
-        env.reset(seed=1)
-        states.append(full_state(env.unwrapped.data))
-        runs.append(run(env, inputs[:length], seed=1))
-    np.testing.assert_array_equal(*states)
-    assert_same(runs[1][:6], runs[0])
-
-
 def test_every_motor_has_its_own_noise_in_every_episode():
     env = codrl_mj.make(CHEETAH, {"b.*": NOISY, "f.*": "lag"}, allow_unstable=True)
     views, keys = motor_slots(env.unwrapped.data, env.motors), []
@@ -218,78 +123,12 @@ def test_every_motor_has_its_own_noise_in_every_episode():
     assert keys[0][3:] == [0.0] * 3
 
 
-def limited_cheetah(**options):
-    """Make a third-party environment by a function."""
-    return gym.wrappers.TimeLimit(HalfCheetahEnv(**options), 500)
-
-
-COMMANDED = {"action": "current", "observe_actuator": True}
-LIMITED = {"disturbances": {"command_rate": 5.0}, "max_episode_steps": 7}
-DRAWN = {"randomize": {"time_constant": "loguniform(0.01, 1)"}}
-COPIES = {
-    "deepcopy": copy.deepcopy,
-    "pickle": lambda env: pickle.loads(pickle.dumps(env)),
-    "spec": lambda env: gym.make(env.spec),
-}
-FROM_IDS = [(CHEETAH, MAXON, COMMANDED), (CHEETAH, {".*": "lag"}, LIMITED)]
-FROM_FUNCTIONS = [
-    (creator, {".*": "lag"}, DRAWN) for creator in (limited_cheetah, HalfCheetahEnv, BareEnv)
-]
-
-
-@pytest.mark.parametrize(
-    ("method", "creator", "actuators", "options"),
-    [
-        *((method, *case) for method in COPIES for case in FROM_IDS),
-        *((method, *case) for method in ("deepcopy", "pickle") for case in FROM_FUNCTIONS),
-    ],
-)
-def test_copies_have_the_same_motors_and_randomization(method, creator, actuators, options):
-    """Check copies, which Gymnasium makes by calling the constructor again."""
-    env = codrl_mj.make(creator, actuators, **options)
-    copied, inputs = COPIES[method](env), actions(env, 10)
-    expected = [run(env, inputs, seed) for seed in (1, 2)]
-    for seed, rows in zip((1, 2), expected, strict=True):
-        assert_same(run(copied, inputs, seed), rows)
-    assert not np.array_equal(*(np.array([row[0] for row in rows]) for rows in expected))
-    assert copied.step(inputs[0])[4]["desired_force"].shape == inputs[0].shape
-    assert copy.deepcopy(env.unwrapped).model.nplugin == len(env.motors)
-
-
-@pytest.mark.parametrize(("env_id", "count"), [(CHEETAH, 6), ("InvertedPendulum-v5", 1)])
-def test_info_has_arrays_for_several_motors_and_numbers_for_one(env_id, count):
-    env = codrl_mj.make(env_id, MAXON)
-    *_, info = run(env, actions(env, 1), seed=0)[-1]
-    for name in ("desired_force", "actual_force", *Drive.Signals._fields):
-        kind = (bool if count == 1 else np.bool_) if name == "saturated" else float
-        if count == 1:
-            assert type(info[name]) is kind
-        else:
-            assert (info[name].shape, info[name].dtype) == ((count,), kind)
-
-
 def test_signals_that_a_family_lacks_are_nan():
     env = codrl_mj.make(CHEETAH, {"b.*": MAXON[".*"], "f.*": "lag"}, observe_actuator=True)
     observation, *_, info = run(env, actions(env, 5), seed=0)[-1]
     np.testing.assert_array_equal(np.isnan(info["current"]), [False] * 3 + [True] * 3)
     assert not info["saturated"][3:].any()
     assert observation.shape == (17 + 3 * 2,)
-
-
-def test_observations_end_with_the_sensor_values():
-    env, original = codrl_mj.make(CHEETAH, MAXON, observe_actuator=True), gym.make(CHEETAH)
-    space = original.observation_space
-    assert env.observation_space.dtype == space.dtype
-    np.testing.assert_array_equal(env.observation_space.low, np.append(space.low, [-np.inf] * 12))
-    np.testing.assert_array_equal(env.observation_space.high, np.append(space.high, [np.inf] * 12))
-    assert env.sensor_names == tuple(
-        f"{motor}.{name}" for motor in BACK + FRONT for name in Drive.OBSERVED
-    )
-    assert not env.reset(seed=0)[0][17:].any()
-    for action in actions(env, 5):
-        observation, *_, info = env.step(action)
-        np.testing.assert_array_equal(observation[17::2], info["current"])
-        np.testing.assert_array_equal(observation[18::2], info["reference_current"])
 
 
 def test_current_commands_are_in_amperes_up_to_the_motors_limits():

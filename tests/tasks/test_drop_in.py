@@ -108,3 +108,14 @@ def test_reset_options_give_gymnasiums_initial_states(task, options):
 def test_reset_options_are_checked_as_gymnasium_checks_them(task, name):
     with pytest.raises(ValueError, match="could not be converted to a float"):
         ours(task).reset(options={name: "wide"})
+
+
+@every_rebuilt
+def test_every_task_is_registered_with_limits_and_spaces_of_the_environment_it_rebuilds(task):
+    rebuilt, original = ours(task, actuator="ideal"), gymnasiums(task)
+    assert rebuilt.spec.max_episode_steps == original.spec.max_episode_steps
+    assert rebuilt.spec.reward_threshold == original.spec.reward_threshold
+    assert rebuilt.action_space == original.action_space
+    assert rebuilt.observation_space == original.observation_space
+    render_fps = original.unwrapped.metadata["render_fps"]
+    assert rebuilt.unwrapped.metadata["render_fps"] == render_fps

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from codrl_mj.tasks import TASKS
+from tests.conformance.episodes import assert_same, plain, run
 from tests.disturbances.everything import MOST, RUBBED, imperfect
-from tests.envs.faces import plain, run
-from tests.envs.vectors import assert_same
 from tests.matrix import matrix_params
 
 WEAK = {"controller": {"kp": 1.0, "ki": 0.5, "max_voltage": 3.0}}
