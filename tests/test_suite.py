@@ -183,20 +183,6 @@ def test_a_snapshot_continues_the_same_at_any_time_of_restoring(task, ahead):
     np.testing.assert_array_equal(_run_actions(env, actions[5:]), rest)
 
 
-def test_a_snapshot_with_the_step_count_can_be_restored_before_a_first_reset():
-    config = EnvConfig("cartpole", "weak", max_episode_steps=7)
-    env, other_env = suite.load(config, task_kwargs={"random": 0}), suite.load(config)
-    env.reset()
-    _run_actions(env, [0, 1])
-    other_env.restore(env.snapshot())
-    np.testing.assert_array_equal(
-        _run_actions(other_env, [0, 1, 1, 0, 1]), _run_actions(env, [0, 1, 1, 0, 1])
-    )
-    assert other_env.step(0).first()
-    with pytest.raises(ValueError, match=r"snapshot\['physics'\] is of shape \(3,\)"):
-        env.restore(env.snapshot() | {"physics": np.zeros(3)})
-
-
 @every_task
 def test_dm_controls_reset_context_keeps_the_user_s_state(task):
     """Check that dm_control's forward passes keep the user's state, and the motor at rest."""
@@ -265,36 +251,29 @@ def test_pixels_show_the_present_state_and_change_nothing(task):
 # -- third-party environments ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", ["Hopper-v5", "Taxi-v4", "Blackjack-v1"])
-def test_any_gymnasium_environment_keeps_the_contract(env_id):
-    """Check vectors, numbers and tuples of them, with and without motors."""
+@pytest.mark.parametrize("env_id", ["Taxi-v4", "Blackjack-v1"])
+def test_observations_may_be_numbers_and_tuples_of_them(env_id):
     ours, theirs = (gymnasium.make(env_id, disable_env_checker=True) for _ in range(2))
-    if env_id == "Hopper-v5":
-        config = EnvConfig(
-            env_id, {".*": "lag"}, randomize={".*": {"time_constant": "uniform(0.01, 0.02)"}}
-        )
-        env, theirs = suite.load(config, task_kwargs={"random": 4}), config.build()
-        assert env.physics.named.data.qpos["rootz"] == env.data.qpos[1]
-        assert env.control_timestep() == env.dt == 0.008
-    else:
-        env = suite.DmEnvironment(ours, 4)
+    env = suite.DmEnvironment(ours, 4)
     timesteps, expected = [env.reset()], [theirs.reset(seed=4)]
     for action in _actions(theirs.action_space, 60, 0):
         timesteps.append(env.step(action))
         expected.append(theirs.step(action))
-        assert (timesteps[-1].reward, timesteps[-1].last()) == (
-            expected[-1][1],
-            expected[-1][2] or expected[-1][3],
-        )
-        if timesteps[-1].last():
+        is_last = expected[-1][2] or expected[-1][3]
+        assert (timesteps[-1].reward, timesteps[-1].last()) == (expected[-1][1], is_last)
+        if is_last:
             timesteps.append(env.step(action))
             expected.append(theirs.reset())
     for timestep, expected_step in zip(timesteps, expected, strict=True):
         np.testing.assert_array_equal(timestep.observation["observations"], expected_step[0])
         env.observation_spec()["observations"].validate(timestep.observation["observations"])
-    if env_id == "Hopper-v5":
-        assert env.info["desired_force"].shape == (3,)
-        assert env.randomization == theirs.randomization != {}
+
+
+def test_the_physics_of_a_third_party_environment_is_a_view_too():
+    env = suite.load("Hopper-v5", actuator={".*": "lag"})
+    env.reset()
+    assert env.physics.named.data.qpos["rootz"] == env.data.qpos[1]
+    assert env.control_timestep() == env.dt == 0.008
 
 
 # -- refusals -------------------------------------------------------------------------------------

@@ -61,6 +61,25 @@ EVERYTHING = {
     "max_episode_steps": 40,
 }
 """Arguments of a third-party environment with `NOISY` motors."""
+FURUTA = {
+    "current": {"actuator": "default", "action": "current", "observe_actuator": True},
+    "voltage": {
+        "actuator": "default",
+        "action": "voltage",
+        "disturbances": {"command_delay": 0.004},
+    },
+    "randomized": {
+        "actuator": "default",
+        "randomize": {
+            "motor.resistance": Uniform(6.0, 9.0),
+            "model.length.rod": Uniform(0.8, 1.2),
+            "model.length.arm": Uniform(0.8, 1.2),
+        },
+        "disturbances": {**MOST, "command_delay": 0.004, "pulse_force": 0.001},
+        "observe_actuator": True,
+    },
+}
+"""Arguments by setup for the motor of the Furuta pendulum, which is a drive."""
 
 
 # -- arguments of tasks ---------------------------------------------------------------------------
@@ -88,20 +107,18 @@ def arguments(task, setup, physics="mujoco"):
     """Return the arguments of a task's environment in one of `SETUPS`."""
     if setup in ("ideal", "default"):
         return {"actuator": setup}
+    if not TASKS[task].paper:
+        return FURUTA[setup]
     if setup in ("force", "current"):
         return commanded(task, setup) | {"observe_actuator": setup == "current"}
     if setup == "voltage":
         draws = {"motor.inductance": Uniform(0.15, 0.3)}
         return commanded(task, setup) | {"observe_actuator": True, "randomize": draws}
-    is_paper = bool(TASKS[task].paper)
-    model = {} if physics == "analytic" else scales(task)
     return {
-        "actuator": imperfect(named_actuator("paper", task).as_mapping())
-        if is_paper
-        else "default",
-        "randomize": (DRIVE if is_paper else {"motor.resistance": Uniform(6.0, 9.0)}) | model,
+        "actuator": imperfect(named_actuator("paper", task).as_mapping()),
+        "randomize": DRIVE | ({} if physics == "analytic" else scales(task)),
         "disturbances": MOST,
-        "joint": None if physics == "analytic" or not is_paper else RUBBED,
+        "joint": None if physics == "analytic" else RUBBED,
         "observe_actuator": True,
     }
 
@@ -230,13 +247,13 @@ def interfaces(name, env, options, quick, labels=INTERFACES, **supports):
 
 
 QUICK = {
-    ("pendulum", "randomized", "mujoco"): ("single", "dm_env", "sb3", "SameStep", "NextStep"),
+    ("pendulum", "randomized", "mujoco"): ("single", "dm_env", "sb3", "NextStep"),
     ("pendulum", "randomized", "analytic"): ("single", "SameStep"),
     ("cartpole", "ideal", "mujoco"): ("single",),
     ("cartpole", "current", "mujoco"): ("single", "Disabled", "dm_env"),
     ("cartpole", "voltage", "analytic"): ("single", "sb3"),
-    ("mountain_car", "default", "mujoco"): ("single", "SameStep"),
-    ("pendulum", "force", "analytic"): ("single",),
+    ("mountain_car", "default", "mujoco"): ("single",),
+    ("furuta", "randomized", "mujoco"): ("single", "SameStep"),
 }
 """Task, setup and physics -> interfaces that `make test` runs."""
 
@@ -250,9 +267,9 @@ def task_environments():
         for setup in SETUPS
     ):
         # The closed form of the Furuta pendulum has no rotor, which its own motor needs.
-        if not TASKS[task].paper and setup not in ("ideal", "default", "randomized"):
-            continue
-        if not TASKS[task].paper and physics == "analytic" and setup != "ideal":
+        if not TASKS[task].paper and (
+            (physics == "analytic" and setup != "ideal") or setup == "force"
+        ):
             continue
         options = arguments(task, setup, physics) | {"physics": physics}
         quick = QUICK.get((task, setup, physics), ())
@@ -287,12 +304,12 @@ FUNCTION = f"{__name__}:limited_cheetah"
 def third_party_environments():
     """Yield the entries of third-party environments, made by an id, a function and a source."""
     for name, env, options, quick, supports in (
-        ("cheetah-two_kinds", CHEETAH, TWO_KINDS, ("single", "SameStep", "sb3"), {"motors": 6}),
+        ("cheetah-two_kinds", CHEETAH, TWO_KINDS, ("single", "sb3"), {"motors": 6}),
         (
             "cheetah-current",
             CHEETAH,
             {"actuator": MAXON, "action": "current", "observe_actuator": True},
-            ("single",),
+            (),
             {"motors": 6},
         ),
         (

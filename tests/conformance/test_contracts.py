@@ -212,7 +212,13 @@ def test_infos_have_forces_signals_and_saturation_for_each_motor(environment):
             assert (info[name].shape, info[name].dtype) == (shape, kind), name
         else:
             assert type(info[name]) is (bool if name == "saturated" else float), name
-    np.testing.assert_array_equal(np.isnan(info["desired_force"]), False)
+        # A signal that the family of a motor lacks is NaN, and such a motor never saturates.
+        motor_columns = np.array(info[name]).reshape(-1, motors)
+        for motor, values in zip(motors_of(env).values(), motor_columns.T, strict=True):
+            lacks = name in signals - {*type(motor).Signals._fields} - {"saturated"}
+            np.testing.assert_array_equal(np.isnan(values), lacks, name)
+            if name == "saturated" and name not in type(motor).Signals._fields:
+                assert not values.any()
     if environment.options.get("actuator") == "ideal":
         np.testing.assert_array_equal(info["actual_force"], info["desired_force"])
         assert not np.any(info["saturated"])
@@ -285,9 +291,10 @@ def test_actions_outside_the_space_saturate_or_are_refused(environment):
     else:
         for action, bound in zip(signed(space, 3.0), signed(space, 1.0), strict=True):
             outcome, expected = env.step(action), expected_env.step(bound)
-            np.testing.assert_array_equal(outcome[0], expected[0])
-            if environment.is_task:
-                assert_same(plain(outcome), plain(expected))
+            # In float32 a bound of the space is rounded, the limit of the command is not.
+            np.testing.assert_allclose(outcome[0], expected[0], rtol=1e-6, atol=1e-7)
+            for name in expected[4] if environment.is_task else ():
+                np.testing.assert_allclose(outcome[4][name], expected[4][name], rtol=1e-5)
     before = env.snapshot()
     for action in refused:
         with pytest.raises(ValueError, match=r"action"):
@@ -335,6 +342,10 @@ def test_resets_bring_motors_to_rest(environment):
             np.testing.assert_array_equal(slot[2:], 0.0)
         # An ideal motor of a task has no state.
         keys.append([slot[1] for slot in slots.values() if slot.size])
+        for motor, slot in zip(env.motors.values(), slots.values(), strict=True):
+            # Load pulses need a key too.
+            is_keyless = not motor.random and "disturbances" not in environment.options
+            assert not is_keyless or not slot[:2].any()
     fresh_env.reset(seed=7)
     fresh_slots = motor_slots(fresh_env.unwrapped.data, fresh_env.motors)
     assert [slot[1] for slot in fresh_slots.values() if slot.size] == keys[0]
@@ -354,15 +365,15 @@ def test_snapshots_continue_bit_for_bit(environment):
             run(env, steps, seed=0)
         snapshot = env.snapshot()
         assert all(isinstance(array, np.ndarray) for array in snapshot.values())
-        runs = []
-        for resumed in (env, fresh_env, used_env):
+        # Without the whole state, a restored environment can only start an episode.
+        runs = [(None, run(env, 22, seed=1))] if steps and environment.has_snapshots else []
+        for resumed in (fresh_env, used_env):
             restored = resumed.restore(load(save(snapshot)))
             if environment.has_snapshots:
-                assert restored is None
                 assert_same(resumed.snapshot(), snapshot)
             if steps is None:
                 start_episode(resumed)
-            runs.append((plain(restored), run(resumed, 22 if steps else 6, seed=1)))
+            runs.append((plain(restored), run(resumed, 22, seed=1)))
         for run_of_resumed in runs[1:]:
             assert_same(run_of_resumed, runs[0])
 

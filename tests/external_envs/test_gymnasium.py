@@ -17,7 +17,6 @@ from codrl_mj.actuators import (
     VoltageDrive,
 )
 from codrl_mj.catalogue import motor_entry
-from codrl_mj.engine.reading import motor_slots
 from codrl_mj.envs.config import EnvConfig
 from tests.conformance.environments import NOISY
 from tests.external_envs.models import ARM, V5, ArmEnv, BareEnv, actions, assert_same, run
@@ -109,26 +108,6 @@ def test_setting_the_state_brings_motors_to_rest():
     np.testing.assert_array_equal(
         moved, [fresh.step(action)[4]["actual_force"] for action in inputs]
     )
-
-
-def test_every_motor_has_its_own_noise_in_every_episode():
-    env = codrl_mj.make(CHEETAH, {"b.*": NOISY, "f.*": "lag"}, allow_unstable=True)
-    views, keys = motor_slots(env.unwrapped.data, env.motors), []
-    for seed in (7, None, 7):
-        env.reset(seed=seed)
-        keys.append([view[1] for view in views.values()])
-    assert keys[0] == keys[2]
-    assert len({*keys[0][:3], *keys[1][:3]}) == 6
-    # The lag needs no key.
-    assert keys[0][3:] == [0.0] * 3
-
-
-def test_signals_that_a_family_lacks_are_nan():
-    env = codrl_mj.make(CHEETAH, {"b.*": MAXON[".*"], "f.*": "lag"}, observe_actuator=True)
-    observation, *_, info = run(env, actions(env, 5), seed=0)[-1]
-    np.testing.assert_array_equal(np.isnan(info["current"]), [False] * 3 + [True] * 3)
-    assert not info["saturated"][3:].any()
-    assert observation.shape == (17 + 3 * 2,)
 
 
 def test_current_commands_are_in_amperes_up_to_the_motors_limits():

@@ -1,19 +1,15 @@
 """Furuta: mechanics against Lagrange's equations by computer algebra, motor, and environments."""
 
 import functools
-import itertools
 import math
-import warnings
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
 import sympy
-from gymnasium.utils.env_checker import check_env
-from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from codrl_mj import Uniform, make_sb3_vec_env
+from codrl_mj import make_sb3_vec_env
 from codrl_mj.actuators import IDEAL, NAMED, Drive
 from codrl_mj.catalogue import motor_entry
 from codrl_mj.envs.config import EnvConfig
@@ -22,7 +18,7 @@ from codrl_mj.physics import MujocoPhysics, SimulationConfig
 from codrl_mj.sizing.scripted import Scripted, observe_state
 from codrl_mj.tasks import TASKS, resolve_actuators
 from codrl_mj.tasks.furuta import MAX_TORQUE, ReferenceEnv
-from tests.envs.vectors import MODES, assert_equal_episodes, batched, looped
+from tests.envs.vectors import batched
 from tests.matrix import matrix_params
 
 TASK = TASKS["furuta"]
@@ -250,50 +246,6 @@ def test_the_scripted_controller_swings_up_and_balances(actuator):
         Scripted(TASK), lambda: observe_state(EnvConfig("furuta", actuator).build()), 10, seed=0
     )
     assert summarize("furuta", episodes).success.mean == 1.0
-
-
-# -- the faces -------------------------------------------------------------------------------------
-
-
-@every_actuator
-@pytest.mark.parametrize(
-    ("check", "allowed"),
-    [
-        (check_env, "A Box observation space m.* value is -?infinity"),
-        (check_env_sb3, "symmetric and normalized Box action"),
-    ],
-)
-def test_checkers_report_the_same_as_for_gymnasiums_environments(check, allowed, actuator):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", f".*{allowed}")
-        check(gymnasium.make(TASK.env_id, actuator=actuator).unwrapped, skip_render_check=True)
-
-
-FACES = {
-    "torque": {},
-    "ideal": {"actuator": "ideal"},
-    "current": {"action": "current", "observe_actuator": True},
-    "voltage": {"action": "voltage", "disturbances": {"command_delay": 0.004}},
-    "randomised": {
-        "randomize": {"model.length.rod": Uniform(0.8, 1.2), "model.length.arm": Uniform(0.8, 1.2)}
-    },
-}
-
-
-@pytest.mark.parametrize(
-    ("face", "mode"),
-    matrix_params(
-        [*zip(FACES, itertools.cycle(MODES)), ("torque", MODES[1]), ("torque", MODES[2])],
-        itertools.product(FACES, MODES),
-    ),
-)
-def test_a_batch_equals_single_environments_bit_for_bit(face, mode):
-    arguments = FACES[face]
-    ends = assert_equal_episodes(
-        batched("furuta", 3, mode, **arguments), looped("furuta", 3, mode, **arguments), 60
-    )
-    assert ends.any()
 
 
 def test_the_picture_follows_the_rod():
