@@ -288,6 +288,14 @@ class RandomizationState:
         columns = np.array([names.index(name) for name in variation.names], dtype=int)
         return variation.fields(self._values[np.ix_(rows, columns)], additions, shown)
 
+    def nominal_fields(self) -> dict[str, np.ndarray]:
+        """Return the first model's varied fields without drawn values, shape (1, ...)."""
+        variation = self.randomization.variation
+        if variation is None:
+            return {}
+        no_values = np.full((1, len(variation.names)), np.nan)
+        return variation.fields(no_values, self._mounting[1][:1], shown=True)
+
     def report(self, row: int = 0) -> Info:
         """Return a simulation's drawn values for `info`, grouped by pattern; NaN before a reset."""
         report: Info = {}

@@ -33,6 +33,7 @@ from codrl_mj.envs.snapshots import (
 )
 from codrl_mj.external_envs.building import patcher_of
 from codrl_mj.physics.streams import generator_words
+from codrl_mj.physics.variation import write_fields
 
 
 def make_with_motors(
@@ -348,17 +349,24 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
 
     def __getstate__(self) -> PickledState:
         """Return all attributes except those tied to the model, which a copy builds again."""
-        return {
+        state = {
             name: value
             for name, value in self.__dict__.items()
             if name not in ("bank", "_recorder")
         }
+        return state | {"_nominal_fields": self.bank.randomization.nominal_fields()}
 
     def __setstate__(self, state: PickledState) -> None:
         """Restore in this or another process; the copy must then be reset, as in Gymnasium."""
         self.__dict__.update(state, _was_reset=False)
+        nominal_fields: dict[str, np.ndarray] = self.__dict__.pop("_nominal_fields")
         base = self.unwrapped
         # Copied data have their own copy of the model, which the environment must use, too.
         if base.model is not base.data.model:  # type: ignore[attr-defined]
             base.model = base.data.model  # type: ignore[attr-defined]
+        # The copied model has the drawn values of the episode, which would become the new bank's
+        # nominal values. A `MujocoEnv` has built its model again.
+        if not self._has_known_state and nominal_fields:
+            write_fields(base.model, nominal_fields)  # type: ignore[attr-defined]
+            mujoco.mj_setConst(base.model, base.data)  # type: ignore[attr-defined]
         self._bind()

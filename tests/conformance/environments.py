@@ -155,8 +155,6 @@ class Environment:
     """`continue`, `reset` (a copy must be reset first), or empty (there are no copies)."""
     saturates: bool = True
     """True if continuous actions outside the space act like those at its bounds."""
-    defects: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Contract that the package is known to break -> reason."""
     is_quick: bool = False
     """True if `make test` runs it; `make check` runs all."""
 
@@ -326,12 +324,11 @@ def third_party_environments():
     # These store their state anywhere, so that a restored one can only start an episode.
     supports = THIRD | {"has_snapshots": False}
     original = functools.partial(RigEnv, 0.5)
-    supports["defects"] = {"copy": "a copy takes the drawn gravity for the model's own"}
     yield from interfaces(
         "source", "tests.envs.rig:RIG", DRAWN_RIG, ("single",), original=original, **supports
     )
     # The model of the bare environment limits only one of its two controls.
-    supports |= {"motors": 2, "saturates": False, "defects": {}}
+    supports |= {"motors": 2, "saturates": False}
     options = DRAWN_LAG | {"max_episode_steps": 9}
     yield from interfaces(
         "bare", f"{BareEnv.__module__}:BareEnv", options, ("single",), original=BareEnv, **supports
@@ -399,13 +396,6 @@ ENVIRONMENTS = (
 )
 
 
-def marks(environment, contract):
-    """Return the marks of a contract of an environment."""
-    reason = environment.defects.get(contract)
-    xfail = [pytest.mark.xfail(reason=reason, strict=True)] if reason else []
-    return xfail if environment.is_quick else [pytest.mark.matrix, *xfail]
-
-
 def every(contract, supports=lambda _: True):
     """Parametrize a contract over all environments that support it, with ids to select them by."""
     return pytest.mark.parametrize(
@@ -414,7 +404,7 @@ def every(contract, supports=lambda _: True):
             pytest.param(
                 environment,
                 id=f"{environment.name}-{contract}",
-                marks=marks(environment, contract),
+                marks=() if environment.is_quick else pytest.mark.matrix,
             )
             for environment in ENVIRONMENTS
             if supports(environment)
