@@ -38,6 +38,8 @@ class TaskBank(ActuatorBank):
             actuators: the actuators of each simulation, N tuples.
         """
         self.setup, self._physics, self._count = setup, physics, len(actuators)
+        # `signals` is called in every step, and attributes that are written do not change it.
+        self._commands_torque = setup.commands.is_torque_controlled
         apply_values = (
             functools.partial(apply_to_batch, physics)
             if isinstance(physics, MujocoBatchPhysics)
@@ -96,9 +98,7 @@ class TaskBank(ActuatorBank):
         If the actuator does not follow a force command, `desired_force` is the delivered force.
         """
         signals = self._read_info(columns)
-        signals["desired_force"] = (
-            desired if self.setup.commands.is_torque_controlled else signals["actual_force"]
-        )
+        signals["desired_force"] = desired if self._commands_torque else signals["actual_force"]
         return signals
 
     def sensor_values(self, row: np.ndarray | None) -> np.ndarray:
