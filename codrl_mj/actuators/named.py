@@ -242,7 +242,7 @@ def resolve(actuator: ActuatorSetting, paper: DCMotorActuator | None, owner: str
     )
 
 
-# YAML has no schema: whatever a file contains arrives here.
+# YAML has no schema: the value may be of any type.
 FileEntry = Any
 """Entry of an actuator file's `identified` section."""
 _CHANGED = ", changed"

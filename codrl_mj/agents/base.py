@@ -8,12 +8,10 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.boundary import Json, JsonObject
+from codrl_mj.envs.config import Space
 from codrl_mj.fields import Checked, check_memory, check_names, positive_reals
 
-# Spaces of one agent have elements of different types, and torch takes seconds to import, which is
-# too long for callers that only need settings: hence two aliases.
-Space = spaces.Space[Any]
-"""Observation or action space; its elements may be of any type."""
+# torch takes seconds to import, which is too long for callers that only need settings.
 Tensor = Any
 """A `torch.Tensor`."""
 

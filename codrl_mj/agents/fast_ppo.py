@@ -138,7 +138,7 @@ class Gaussian:
         return ActionEvaluation(log_prob, entropy, backward)
 
 
-class FastPPO(PPO):  # mypy does not read the base
+class FastPPO(PPO):
     """Faster implementation of Stable-Baselines3's PPO.
 
     The policy, rollouts, losses and minibatches are the same. Only the order of floating-point

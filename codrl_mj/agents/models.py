@@ -24,7 +24,7 @@ from torch import nn
 from torch.nn import functional
 
 
-class ScaledObservation(FlattenExtractor):  # mypy does not read the base
+class ScaledObservation(FlattenExtractor):
     """Features extractor that multiplies an observation's entries by fixed factors.
 
     Entries without a factor are not scaled.
@@ -47,7 +47,7 @@ class ScaledObservation(FlattenExtractor):  # mypy does not read the base
         return super().forward(observations) * self.factors
 
 
-class UnitActionPolicy(ActorCriticPolicy):  # mypy does not read the base
+class UnitActionPolicy(ActorCriticPolicy):
     """Policy whose actor has its mean and noise in units of the largest action.
 
     For example, the largest torque of 0.08 N*m or the largest voltage of 18 V is 1.
@@ -68,7 +68,7 @@ class UnitActionPolicy(ActorCriticPolicy):  # mypy does not read the base
         return self.action_dist.proba_distribution(mean, self.log_std + self.largest.log())
 
 
-class TwoStreams(nn.Module):  # mypy does not read the base
+class TwoStreams(nn.Module):
     """Network for Q(state, action) with separate layers for state and action, then joint layers."""
 
     def __init__(
@@ -102,7 +102,7 @@ class TwoStreams(nn.Module):  # mypy does not read the base
         return self.joint(torch.cat([self.state_stream(state), self.action_stream(action)], dim=1))
 
 
-class TwoStreamPolicy(TD3Policy):  # mypy does not read the base
+class TwoStreamPolicy(TD3Policy):
     """Actor and critic of DDPG, with `TwoStreams` as networks of the critic."""
 
     def __init__(
@@ -129,7 +129,7 @@ class TwoStreamPolicy(TD3Policy):  # mypy does not read the base
         return critic
 
 
-class TwoRatePPO(PPO):  # mypy does not read the base
+class TwoRatePPO(PPO):
     """Stable-Baselines3's PPO with separate passes and learning rates for actor and critic.
 
     This is the update of Spinning Up and of Keras's example: passes over the rollout improve the
@@ -243,21 +243,21 @@ class _CriticLearningRate:
         update_learning_rate(self.critic.optimizer, self.critic_learning_rate)  # type: ignore[attr-defined]
 
 
-class TwoRateDDPG(_CriticLearningRate, DDPG):  # mypy does not read the base
+class TwoRateDDPG(_CriticLearningRate, DDPG):
     """DDPG with a separate learning rate of the critic, and with `TwoStreams` as its network."""
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TwoStreamPolicy}
 
 
-class TwoRateTD3(_CriticLearningRate, TD3):  # mypy does not read the base
+class TwoRateTD3(_CriticLearningRate, TD3):
     """TD3 with a separate learning rate of the critics."""
 
 
-class TwoRateSAC(_CriticLearningRate, SAC):  # mypy does not read the base
+class TwoRateSAC(_CriticLearningRate, SAC):
     """SAC with a separate learning rate of the critics."""
 
 
-class EpisodicDQN(DQN):  # mypy does not read the base
+class EpisodicDQN(DQN):
     """DQN whose exploration rate is multiplied by a factor, unless None, after every episode."""
 
     def __init__(self, *args: object, exploration_decay: float | None, **kwargs: object) -> None:

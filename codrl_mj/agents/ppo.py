@@ -10,10 +10,10 @@ from codrl_mj.agents.base import (
     AgentModel,
     AgentPolicy,
     DeepAgentConfig,
-    Space,
     TrainingEnvs,
     check_buffer,
 )
+from codrl_mj.envs.config import Space
 from codrl_mj.fields import choice, flag, integer, positive_integers, real
 
 

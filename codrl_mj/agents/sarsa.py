@@ -5,7 +5,8 @@ from typing import ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.agents.base import AgentConfig, AgentModel, AgentPolicy, Space, TrainingEnvs
+from codrl_mj.agents.base import AgentConfig, AgentModel, AgentPolicy, TrainingEnvs
+from codrl_mj.envs.config import Space
 from codrl_mj.fields import integer, positive_integers, real, reals
 
 

@@ -18,7 +18,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 
-from codrl_mj.agents.base import Space
 from codrl_mj.agents.tile_coding import (
     TileCoder,
     action_value,
@@ -31,6 +30,7 @@ from codrl_mj.boundary import Info
 from codrl_mj.compile_cache import njit
 from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.envs.compiled import bind_observation, compiled_kernels
+from codrl_mj.envs.config import Space
 from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.physics import MujocoPhysics, Signals
 from codrl_mj.physics.streams import generator_words, set_generator_words
@@ -202,7 +202,7 @@ def run_episode(
     return total, length, terminated, True
 
 
-class TileCodingPolicy(BasePolicy):  # mypy does not read the base
+class TileCodingPolicy(BasePolicy):
     """Greedy or epsilon-greedy policy by action values that are linear in the active tiles.
 
     With `deterministic=True` the first of equally good actions is chosen. `predict(...,
@@ -354,7 +354,7 @@ class CompiledEpisodes:
         )
 
 
-class SARSA(BaseAlgorithm):  # mypy does not read the base
+class SARSA(BaseAlgorithm):
     """Episodic semi-gradient SARSA (Sutton and Barto, 2018, section 10.1) or SARSA(lambda).
 
     `trace_decay` selects SARSA(lambda). A rollout is an episode: `on_rollout_start` and

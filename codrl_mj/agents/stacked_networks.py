@@ -138,7 +138,7 @@ class StackedNetworks:
                 gradient = self._slope(torch.bmm(gradient, self.weights[index]), layers[index])
 
 
-class VectorAdam(torch.optim.Adam):  # mypy does not read the base
+class VectorAdam(torch.optim.Adam):
     """Adam on one vector, with the state dict of an Adam on the parameters that are views of it.
 
     Saved models can therefore be exchanged with Stable-Baselines3 in both directions.

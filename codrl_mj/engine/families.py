@@ -20,7 +20,7 @@ from numba.extending import register_jitable
 from numpy.typing import ArrayLike
 
 from codrl_mj.actuators import Family, Inputs, family_id, import_path, parameters_type
-from codrl_mj.actuators.model import advance_signature, check_family
+from codrl_mj.actuators.model import Advance, advance_signature, check_family
 from codrl_mj.compile_cache import CompiledCallback, VerifiedMarker, cfunc
 from codrl_mj.engine.memory import (
     call,
@@ -83,8 +83,6 @@ addresses_pointer = named_address("codrl_mj_families", _ADDRESSES.ctypes.data)
 sizes_pointer = named_address("codrl_mj_sizes", _SIZES.ctypes.data)
 import_paths_pointer = named_address("codrl_mj_import_paths", _IMPORT_PATHS.ctypes.data)
 
-Advance = Callable[..., tuple[tuple[float, ...], float, tuple[float, ...]]]
-"""A family's `advance`, which returns the named tuples of its state and its signals."""
 ArrayAdvance = Callable[[ArrayLike, float, ArrayLike, Inputs], tuple[np.ndarray, float, np.ndarray]]
 """A family's `advance` (parameters, timestep, state, inputs) that returns its state and signals as
 arrays.

@@ -119,8 +119,11 @@ class CompiledEnv(NamedTuple):
 class HasSetup(Protocol):
     """Environment of a task, such as `ActuatedEnv`."""
 
-    setup: ResolvedEnv
     physics: Physics
+
+    @property
+    def setup(self) -> ResolvedEnv:
+        """Everything that follows from the configuration."""
 
 
 def compiled_env(env: HasSetup) -> CompiledEnv | None:

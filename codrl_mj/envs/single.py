@@ -102,12 +102,12 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Action]):
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
         config = task_config(task, actuator, arguments)
-        self.setup = ResolvedEnv.build(config)
-        self.physics = self.setup.simulate()
-        self.bank = TaskBank(self.setup, self.physics, [self.setup.simulation.actuators])
+        setup = ResolvedEnv.build(config)
+        self.physics = setup.simulate()
+        self.bank = TaskBank(setup, self.physics, [setup.simulation.actuators])
         """The actuators: their commands, draws, sensors and signals."""
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
+        self.metadata = {**self.metadata, "render_fps": setup.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         self._renderer: OffscreenRenderer | None = None
         self._window: DisplayWindow | None = None
@@ -115,14 +115,19 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Action]):
         if render_mode is not None:
             check_view(self._scene()[1][0], width, height, camera)
         self.action_space = self.bank.action_space
-        self.observation_space = self.setup.observation_space
-        self.observation_names, self.motor_names = self.setup.observation_names, self.task.motors
+        self.observation_space = setup.observation_space
+        self.observation_names, self.motor_names = setup.observation_names, self.task.motors
         self.command = config.action
         """Name of the agent's command."""
         self.signal_names, self.trace_names = self.bank.signal_names, self.bank.trace_names
         """Names of the actuators' signals in `info`, and of the columns of `trace`."""
         self._bound_step: BoundStep | None = None
         self._offer_attributes(self.task)
+
+    @property
+    def setup(self) -> ResolvedEnv:
+        """Everything that follows from the configuration and the attributes that were written."""
+        return self.bank.setup
 
     @property
     def task(self) -> Task:
@@ -199,7 +204,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Action]):
     def _write_attribute(self, name: str, value: AttributeValue) -> None:
         physics = self.physics
         snapshot = physics.snapshot()
-        self.setup = self.bank.setup = write(name, value, self.setup, self._attribute_target())
+        self.bank.setup = write(name, value, self.setup, self._attribute_target())
         self._bound_step = None
         physics.set_model({})
         physics.restore(snapshot)

@@ -15,9 +15,9 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import allow_imports
 from codrl_mj.agents import AgentConfig, agent_from_mapping
-from codrl_mj.agents.base import AgentPolicy, Space
+from codrl_mj.agents.base import AgentPolicy
 from codrl_mj.boundary import JsonObject
-from codrl_mj.envs.config import Env
+from codrl_mj.envs.config import Env, Space
 from codrl_mj.runs import DESCRIPTION, DIGEST, WEIGHTS
 from codrl_mj.runs.files import atomic_write, check_digest, read_json, with_digest, write_json
 

@@ -9,7 +9,7 @@ opposes the speed. All torques in this module act on the load, net of both losse
 import dataclasses
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple, NotRequired, TypedDict, TypeVar, cast
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from codrl_mj.actuators import (
     ActuatorModel,
+    ActuatorSetting,
     Drive,
     GearMotor,
     Servo,
@@ -31,8 +32,6 @@ from codrl_mj.fields import check_names
 
 Number = TypeVar("Number", float, np.ndarray)
 """A number or an array; a function of it has the same type."""
-ActuatorSetting = str | type[ActuatorModel] | ActuatorModel | Mapping[str, object]
-"""Name of an actuator, its family, itself, or a mapping of its fields: see `resolve`."""
 
 
 def find_drive(

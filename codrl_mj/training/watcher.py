@@ -39,7 +39,7 @@ class TrainingCompleted(Exception):  # noqa: N818 - no error
     """Raised to leave Stable-Baselines3's learning loop after the last step of a training."""
 
 
-class Watcher(BaseCallback):  # mypy does not read the base
+class Watcher(BaseCallback):
     """Callback of every training run, which acts between two rollouts."""
 
     def __init__(

@@ -13,6 +13,7 @@ from gymnasium.envs.classic_control import acrobot
 
 from codrl_mj.actuators import ActuatorModel, CurrentLoop, DCMotorActuator, spectral_radius
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationConfig
+from codrl_mj.physics.base import Force
 from codrl_mj.tasks import Task, resolve_actuators
 
 NO_REFERENCE_ENV = (
@@ -113,8 +114,6 @@ STATE_BOUNDS = {
 }
 """Attribute that bounds the states of an environment -> value that removes the bound."""
 
-Force = float | np.ndarray
-"""Force [N] or torque [N*m]; an array for several motors."""
 Equations = Callable[[np.ndarray, Force], np.ndarray]
 """(mechanical state, force) -> derivative of the state."""
 Slope = Callable[[np.ndarray], np.ndarray]

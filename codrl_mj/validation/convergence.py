@@ -32,12 +32,12 @@ from codrl_mj.physics import (
     SimulationDivergedError,
     install_callbacks,
 )
+from codrl_mj.physics.base import Force
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.tasks import PAPER_TASKS, Task, find_task
 from codrl_mj.validation.compare import (
     NO_REFERENCE_ENV,
     Equations,
-    Force,
     gymnasium_equations,
     is_built_in,
     named_actuators,

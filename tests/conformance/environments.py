@@ -183,7 +183,7 @@ def sb3_loop(env, options):
 
 
 def suite_env(env, **options):
-    """Return an environment with the interface of dm_env, whatever its source is."""
+    """Return an environment with the interface of dm_env."""
     if isinstance(env, str) and env in TASKS:
         return suite.load(env, **options)
     return suite.DmEnvironment(codrl_mj.make(env, **options))
