@@ -33,6 +33,9 @@ _INFIX = {
 _BOOL_RESULTS = {"lt", "le", "gt", "ge", "eq", "ne", "not", "isinf", "isnan", "isfinite"}
 _WRAPPING = {"add": "+", "sub": "-", "mul": "*", "shl": "<<"}
 """Operations on ints that may overflow. C defines this for unsigned integers only."""
+# glibc exports an old function named `advance`, which a shared library would call instead.
+DEFAULT_NAME = "advance_actuator"
+"""Name of the C function, unless the user chooses another."""
 _MAX_INT = "9223372036854775807LL"
 
 
@@ -285,7 +288,7 @@ def c_program(actuator: ActuatorModel | Family, portable: bool = False) -> CProg
 
 
 def c_function(
-    actuator: ActuatorModel | Family, name: str = "advance", portable: bool = False
+    actuator: ActuatorModel | Family, name: str = DEFAULT_NAME, portable: bool = False
 ) -> str:
     """Return a file of C99 with a function that advances an actuator by a step.
 

@@ -7,7 +7,7 @@ own function is called.
 import ast
 import functools
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import cast
 
 import numpy as np
@@ -200,16 +200,26 @@ class Arithmetic:
             return left if right else right
         return self.operation("and", "bool", "bool", left, right)
 
-    def call(self, function: object, arguments: tuple[object, ...]) -> object:
+    def call(
+        self, function: object, arguments: tuple[object, ...], keywords: Mapping[str, object]
+    ) -> object:
         """Return the result of a built-in function, or of one of `math` or numpy.
 
         Raises:
             RefusedError: the function is not supported, or not for unknown numbers.
         """
         if not is_supported(function):
-            raise RefusedError(_remedy(function))
-        if not any(map(is_symbolic, arguments)) or function in _ON_TUPLES:
-            return _compute(cast(Callable[..., object], function), *arguments)
+            raise RefusedError(
+                f"{_name(function)} is not supported: use arithmetic, functions of math, and your"
+                " own functions made of these"
+            )
+        python_function = cast(Callable[..., object], function)
+        if function in _ON_TUPLES:
+            return _compute(lambda: python_function(*arguments, **keywords))
+        if keywords:
+            raise RefusedError(f"keyword arguments of {_name(function)}: pass them by position")
+        if not any(map(is_symbolic, arguments)):
+            return _compute(python_function, *arguments)
         values = arguments
         if function in (min, max, sum) and len(arguments) == 1:
             values = cast(tuple[object, ...], arguments[0])
@@ -275,17 +285,18 @@ def _name(function: object) -> str:
     return str(getattr(function, "__name__", function))
 
 
-def _remedy(function: object) -> str:
-    """Return the message about a function that is not supported."""
-    owner = getattr(function, "__self__", None)
-    module = getattr(function, "__module__", None) or type(owner).__module__
-    name = getattr(function, "__qualname__", None) or repr(function)
-    if "random" in f"{module}.{name}":
-        return f"{name} draws random numbers: use codrl_mj.actuators.noise.standard_normal"
-    return (
-        f"{name} is not supported: use arithmetic, functions of math, and your own functions made"
-        " of these"
-    )
+def refuse_random(function: object) -> None:
+    """Raise if a function draws random numbers, which the same state would not repeat.
+
+    Raises:
+        RefusedError: with a remedy.
+    """
+    owner = type(getattr(function, "__self__", None))
+    modules = f"{getattr(function, '__module__', '')} {owner.__module__}".split()
+    if any(module.removeprefix("numpy.").partition(".")[0] == "random" for module in modules):
+        raise RefusedError(
+            f"{_name(function)} draws random numbers: use codrl_mj.actuators.noise.standard_normal"
+        )
 
 
 def _compute(function: Callable[..., object], *arguments: object) -> object:

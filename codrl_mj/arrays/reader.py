@@ -23,7 +23,8 @@ from codrl_mj.arrays.frames import (
     Returned,
     refuse_assignments,
 )
-from codrl_mj.arrays.functions import Arithmetic, is_supported
+from codrl_mj.arrays.functions import Arithmetic, refuse_random
+from codrl_mj.arrays.loops import LoopVariables
 from codrl_mj.arrays.scalars import (
     Backend,
     DryRun,
@@ -40,7 +41,7 @@ from codrl_mj.arrays.scalars import (
     same_structure,
     symbols,
     widest,
-    with_leaves,
+    zeros_like,
 )
 from codrl_mj.arrays.syntax import assigned_names, contains, definition, stop_flag
 
@@ -84,6 +85,7 @@ class Reader(Arithmetic):
             UnsupportedError: its source contains a construct that is not supported.
         """
         function, keywords = getattr(function, "py_func", function), keywords or {}
+        refuse_random(function)
         if function is range:
             return Range.of(arguments)
         if isinstance(function, FunctionType):
@@ -97,9 +99,7 @@ class Reader(Arithmetic):
             return cast(Callable[..., object], function)(*arguments, **keywords)
         if isinstance(function, MethodType):
             return self.read(function.__func__, (owner, *arguments), keywords)
-        if keywords and is_supported(function):
-            raise RefusedError(f"keyword arguments of {function!r}: pass them by position")
-        return self.call(function, arguments)
+        return self.call(function, arguments, keywords)
 
     def _read_source(
         self,
@@ -224,7 +224,7 @@ class Reader(Arithmetic):
         names = [name for name in assigned_names([statement]) if name in {**then, **otherwise}]
         # A name that only one side assigns is used only if that side ran. So on the other side it
         # may have any value.
-        stand_ins = {name: _zeros(then.get(name, otherwise.get(name))) for name in names}
+        stand_ins = {name: zeros_like(then.get(name, otherwise.get(name))) for name in names}
         unusable = [
             name
             for name in names
@@ -303,43 +303,61 @@ class Reader(Arithmetic):
             self.run([ast.fix_missing_locations(guarded)], frame)
 
     def _loop(self, loop: ast.For | ast.While, frame: Frame, counter: Range | None) -> None:
-        """Execute a loop whose number of iterations may be unknown."""
+        """Execute a loop whose number of iterations may be unknown.
+
+        Args:
+            loop: the loop.
+            frame: function that contains it.
+            counter: range of the loop; None for `while`.
+        """
         if isinstance(loop, ast.While) and contains(loop.test, ast.NamedExpr):
             raise RefusedError("an assignment in a while condition: assign in the loop's body")
         iterations = None if counter is None or stop_flag(loop) else counter.iterations
         if iterations == 0:
             return
-        reading = _LoopReading(self, loop, frame, counter)
-        initial, kinds = self._dry_run(reading.settle)
-        tree = tuple(initial.values())
-        flat_kinds = [kind for name in initial for kind in kinds[name]]
+        target = loop.target if isinstance(loop, ast.For) else None
+        hidden = [] if target is None else assigned_names([ast.Expr(target)])
+        names = [name for name in assigned_names([loop]) if name not in hidden]
+        variables = LoopVariables(names, frame.variables)
+        if counter is not None:
+            variables.initial[_COUNTER] = counter.start
 
-        def variables(operands: list[Operand]) -> dict[str, object]:
-            values = cast(tuple[object, ...], symbols(tree, flat_kinds, operands))
-            return dict(zip(initial, values, strict=True))
+        def condition(values: Mapping[str, object]) -> object:
+            if isinstance(loop, ast.While):
+                holds: object = self.truth(self.value(loop.test, frame.copy(values)))
+            elif counter is not None:
+                comparison = ast.Lt if counter.step > 0 else ast.Gt
+                holds = self.compare(comparison, values[_COUNTER], counter.stop)
+            stop = stop_flag(loop)
+            return holds if stop is None else self.both(self.unary(ast.Not, values[stop]), holds)
 
-        def body(operands: list[Operand]) -> list[Operand]:
-            after = reading.body(variables(operands))
-            values = [
-                number
-                for name, value in initial.items()
-                for number in (() if isinstance(value, AfterLoop) else leaves(after[name]))
-            ]
-            return self._operands(values, flat_kinds)
+        def body(values: Mapping[str, object]) -> Mapping[str, object]:
+            inner = frame.copy(values)
+            if counter is not None and target is not None:
+                self.bind(target, values[_COUNTER], inner)
+            self.run(loop.body, inner)
+            if counter is not None:
+                after = self.binary(ast.Add, values[_COUNTER], counter.step)
+                inner.variables[_COUNTER] = after
+            return inner.variables
 
+        self._dry_run(lambda: variables.settle(condition, body))
+        kinds = variables.all_kinds
         results = self.backend.loop(
             Loop(
-                self._operands(leaves(tree), flat_kinds),
-                flat_kinds,
-                lambda operands: self.operand(reading.condition(variables(operands)), "bool"),
-                body,
+                self._operands(variables.numbers(variables.initial), kinds),
+                kinds,
+                lambda operands: self.operand(condition(variables.symbols(operands)), "bool"),
+                lambda operands: self._operands(
+                    variables.numbers(body(variables.symbols(operands))), kinds
+                ),
                 iterations,
             )
         )
-        frame.variables.update(variables(results))
+        frame.variables.update(variables.symbols(results))
         frame.variables.pop(_COUNTER, None)
-        if isinstance(loop, ast.For):
-            self.bind(loop.target, AFTER_LOOP, frame)
+        if target is not None:
+            self.bind(target, AFTER_LOOP, frame)
 
     # Expressions
 
@@ -474,98 +492,6 @@ class Reader(Arithmetic):
         for left, op, right in zip(values, node.ops, values[1:], strict=False):
             result = self.both(result, self.compare(type(op), left, right))
         return result
-
-
-class _LoopReading:
-    """Condition and body of a loop as functions of the variables that change in it.
-
-    Args:
-        reader: executor of condition and body.
-        loop: the loop.
-        frame: function that contains it.
-        counter: range of its variable, which is a variable of the loop too; None for `while`.
-    """
-
-    def __init__(
-        self, reader: Reader, loop: ast.For | ast.While, frame: Frame, counter: Range | None
-    ) -> None:
-        """Collect the variables of the loop."""
-        self.reader, self.loop, self.frame, self.counter = reader, loop, frame, counter
-        targets = assigned_names([ast.Expr(loop.target)]) if isinstance(loop, ast.For) else []
-        self.names = [name for name in assigned_names([loop]) if name not in targets]
-        self.initial = {
-            name: frame.variables[name] for name in self.names if name in frame.variables
-        }
-        if counter is not None:
-            self.initial[_COUNTER] = counter.start
-
-    def condition(self, variables: Mapping[str, object]) -> object:
-        """Return whether another iteration follows."""
-        reader = self.reader
-        if isinstance(self.loop, ast.While):
-            inner = self.frame.copy(variables)
-            holds: object = reader.truth(reader.value(self.loop.test, inner))
-        else:
-            counter = cast(Range, self.counter)
-            comparison = ast.Lt if counter.step > 0 else ast.Gt
-            holds = reader.compare(comparison, variables[_COUNTER], counter.stop)
-        stop = stop_flag(self.loop)
-        return holds if stop is None else reader.both(reader.unary(ast.Not, variables[stop]), holds)
-
-    def body(self, variables: Mapping[str, object]) -> dict[str, object]:
-        """Return the variables after an iteration."""
-        inner = self.frame.copy(variables)
-        if self.counter is not None and isinstance(self.loop, ast.For):
-            self.reader.bind(self.loop.target, variables[_COUNTER], inner)
-        self.reader.run(self.loop.body, inner)
-        after = {name: inner.variables[name] for name in self.names if name in inner.variables}
-        if self.counter is not None:
-            after[_COUNTER] = self.reader.binary(ast.Add, variables[_COUNTER], self.counter.step)
-        return after
-
-    def settle(self) -> tuple[dict[str, object], dict[str, list[Kind]]]:
-        """Return the variables before the loop, and kinds that hold in all iterations.
-
-        A name that the body assigns first has no value before the loop; any number will do. The
-        kinds grow until an iteration changes none: an int that becomes a float is one throughout.
-
-        Raises:
-            RefusedError: a variable changes its structure in an iteration.
-        """
-        initial = self.initial
-        kinds = {name: _kinds(value) for name, value in initial.items()}
-        while True:
-            variables = {
-                name: symbols(value, kinds[name], [None] * len(kinds[name]))
-                for name, value in initial.items()
-            }
-            self.condition(variables)
-            before = dict(kinds)
-            for name, value in self.body(variables).items():
-                if isinstance(value, AfterLoop) or isinstance(initial.get(name), AfterLoop):
-                    initial[name], kinds[name] = AFTER_LOOP, []
-                elif name not in initial:
-                    initial[name], kinds[name] = _zeros(value), _kinds(value)
-                elif not same_structure(initial[name], value):
-                    raise RefusedError(
-                        f"{name.split()[0]} is {describe(initial[name])} before the loop and"
-                        f" {describe(value)} after an iteration: make them alike"
-                    )
-                else:
-                    kinds[name] = list(map(widest, kinds[name], _kinds(value)))
-            if kinds == before:
-                return initial, kinds
-
-
-def _kinds(value: object) -> list[Kind]:
-    """Return the kinds of the numbers of a nested tuple."""
-    return [kind_of(number) for number in leaves(value)]
-
-
-def _zeros(value: object) -> object:
-    """Return a nested tuple with zeros in place of its numbers."""
-    zeros: dict[Kind, Number] = {"bool": False, "int": 0, "float": 0.0}
-    return with_leaves(value, iter([zeros[kind] for kind in _kinds(value)]))
 
 
 def _is_bool(value: object) -> bool:

@@ -44,6 +44,8 @@ class Scalar:
         self._refuse()
 
     __hash__ = object.__hash__
+    __lt__ = __le__ = __gt__ = __ge__ = __eq__
+    __add__ = __sub__ = __mul__ = __truediv__ = __radd__ = __rsub__ = __rmul__ = __eq__
 
     @staticmethod
     def _refuse() -> NoReturn:
@@ -170,6 +172,17 @@ def with_leaves(tree: object, numbers: Iterator[object]) -> object:
 def symbols(tree: object, kinds: Sequence[Kind], operands: Sequence[Operand]) -> object:
     """Return a nested tuple with its numbers replaced by symbols."""
     return with_leaves(tree, iter([Scalar(*pair) for pair in zip(kinds, operands, strict=True)]))
+
+
+def kinds_of(tree: object) -> list[Kind]:
+    """Return the kinds of the numbers of a nested tuple."""
+    return [kind_of(number) for number in leaves(tree)]
+
+
+def zeros_like(tree: object) -> object:
+    """Return a nested tuple with zeros in place of its numbers."""
+    zeros: dict[Kind, Number] = {"bool": False, "int": 0, "float": 0.0}
+    return with_leaves(tree, iter([zeros[kind] for kind in kinds_of(tree)]))
 
 
 def is_symbolic(value: object) -> bool:

@@ -1,0 +1,1 @@
+"""Tests of the back ends for C and for arrays."""
