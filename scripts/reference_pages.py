@@ -34,6 +34,7 @@ ROOMS = (
     *(
         "actuators",
         "agents",
+        "arrays",
         "catalogue",
         "deploy",
         "disturbances",

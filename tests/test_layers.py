@@ -18,6 +18,7 @@ ALLOWED = {
     "fields": set(),
     "user_code": {"fields"},
     "actuators": {"catalogue", "fields", "user_code"},
+    "arrays": {"actuators", "fields", "user_code"},
     "disturbances": {"actuators", "fields"},
     "tasks": {"actuators", "fields", "user_code"},
     "catalogue": {"fields", "user_code"},
@@ -198,6 +199,7 @@ ALLOWED = {
         *(
             "actuators",
             "agents",
+            "arrays",
             "catalogue",
             "disturbances",
             "envs.config",
@@ -231,6 +233,7 @@ LIBRARIES = {
     "fields": set(),
     "user_code": {"numpy", "yaml"},
     "actuators": {"numpy"},
+    "arrays": {"numpy"},
     "disturbances": {"numpy"},
     "tasks": {"numpy", "gymnasium", "mujoco"},
     "catalogue": {"pint"},

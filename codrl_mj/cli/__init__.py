@@ -68,6 +68,7 @@ VERBS = {
     "motor show": "motor:Show",
     "motor design": "motor:Design",
     "motor step": "motor:Step",
+    "motor write": "motor:Write",
     "motor feasible": "motor_choice:Feasible",
     "motor choose": "motor_choice:Choose",
     "advise": "advise:Advise",

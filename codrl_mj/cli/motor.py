@@ -1,4 +1,4 @@
-"""`codrl-mj motor list`, `new`, `show`, `design` and `step`: off-the-shelf and custom motors."""
+"""`codrl-mj motor list`, `new`, `show`, `design`, `step`, `write`: off-the-shelf, custom motors."""
 
 import dataclasses
 import math
@@ -416,6 +416,39 @@ class New:
 
         new_motor(self.file)
         print(f"wrote {self.file}: fill it in; next: {command('motor', 'show', self.file)}")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Write:
+    """Write a motor and its drive as a function of C, for other simulators and controllers.
+
+    The function advances the drive by one step: it takes the state and the desired torque, position
+    and speed, and returns the torque, exactly as in the simulation (docs/arrays.md).
+
+    Example: codrl-mj motor write maxon-ec45-flat-50w --gear-ratio 20 --as c --out motor.c
+    """
+
+    name: MotorName
+    changes: Settings = Changes()
+    language: Annotated[Literal["c"], tyro.conf.arg(name="as")] = "c"
+    """Language of the function: C99, without other files."""
+    out: Path | None = None
+    """File to write. Without it the function is printed."""
+
+    def run(self) -> int:
+        """Write the file."""
+        from codrl_mj.arrays import c_function
+        from codrl_mj.runs.files import atomic_write
+
+        text = c_function(self.changes.drive(self.name))
+        if self.out is None:
+            print(text, end="")
+            return 0
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(self.out) as temporary:
+            temporary.write_text(text)
+        print(f"wrote {self.out}")
         return 0
 
 

@@ -360,3 +360,16 @@ def test_a_warning_is_printed_once_however_many_environments_it_is_about(tmp_pat
     line = f"train furuta {TINY} --env.disturbances.command-delay 2"
     assert main([*line.split(), "--out", str(tmp_path / "late")]) == 0
     assert capsys.readouterr().err.count("a delay of 100 environment steps") == 1
+
+
+def test_a_motor_is_written_as_c(capsys, tmp_path):
+    out = tmp_path / "folder" / "motor.c"
+    words = ["motor", "write", "maxon-ec45-flat-50w", "--gear-ratio", "20", "--as", "c"]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert "double advance_actuator(" in text
+    assert main([*words, "--out", str(out)]) == 0
+    assert capsys.readouterr().out == f"wrote {out}\n"
+    assert out.read_text() == text
+    assert main([*words[:3], "--gear-ratio", "10"]) == 0
+    assert capsys.readouterr().out != text
