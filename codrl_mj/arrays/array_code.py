@@ -12,7 +12,7 @@ import numpy as np
 
 from codrl_mj.actuators import Family, Inputs, parameters_type
 from codrl_mj.arrays.family import read_advance
-from codrl_mj.arrays.scalars import Kind, Loop, RefusedError, Scalar
+from codrl_mj.arrays.scalars import Kind, RefusedError, Scalar, ScalarLoop
 
 # numpy, torch and JAX have no common type of arrays, and none of modules.
 Array = Any
@@ -124,7 +124,7 @@ class ArrayCode:
         pairs = zip(left_side, self._restricted(~condition, otherwise), strict=True)
         return [self._module.where(condition, left, right) for left, right in pairs]
 
-    def loop(self, loop: Loop) -> list[Array]:
+    def loop(self, loop: ScalarLoop) -> list[Array]:
         """Return the variables of a loop when all entries have finished."""
 
         def running(values: list[Array]) -> Array:

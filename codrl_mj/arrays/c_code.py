@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from codrl_mj.actuators import ActuatorModel, Family, Inputs, family_name, parameters_type
 from codrl_mj.arrays.family import read_advance
-from codrl_mj.arrays.scalars import Kind, Loop, Scalar
+from codrl_mj.arrays.scalars import Kind, Scalar, ScalarLoop
 
 _TYPES: dict[Kind, str] = {"bool": "int", "int": "long long", "float": "double"}
 _INFIX = {
@@ -169,7 +169,7 @@ class CCode:
         self._line("}")
         return names
 
-    def loop(self, loop: Loop) -> list[str]:
+    def loop(self, loop: ScalarLoop) -> list[str]:
         """Write a loop, and return the names of its variables."""
         names = [self._declare(*pair) for pair in zip(loop.kinds, loop.initial, strict=True)]
         self._line("while (1) {")

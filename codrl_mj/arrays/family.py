@@ -7,11 +7,11 @@ from codrl_mj.actuators import Family, Inputs, parameters_type
 from codrl_mj.actuators import model as actuator_model
 from codrl_mj.arrays.reader import Reader
 from codrl_mj.arrays.scalars import (
-    Backend,
     DryRun,
     Operand,
     RefusedError,
     Scalar,
+    ScalarBackend,
     UnsupportedError,
     leaves,
     with_leaves,
@@ -19,7 +19,7 @@ from codrl_mj.arrays.scalars import (
 from codrl_mj.user_code import check_form, source_location
 
 
-class Advanced(NamedTuple):
+class AdvanceOperands(NamedTuple):
     """Result of `advance` as a back end represents it: floats."""
 
     state: list[Operand]
@@ -29,12 +29,12 @@ class Advanced(NamedTuple):
 
 def read_advance(
     family: Family,
-    backend: Backend,
+    backend: ScalarBackend,
     parameters: Mapping[str, object],
     timestep: object,
     state: Mapping[str, object],
     inputs: Mapping[str, object],
-) -> Advanced:
+) -> AdvanceOperands:
     """Pass the operations of a family's `advance` to a back end.
 
     Args:
@@ -63,7 +63,7 @@ def read_advance(
     zeros = with_leaves(result, iter([0.0] * len(leaves(result))))
     check_form(advance, zeros, *actuator_model.advance_signature(family))
     after, torque, signals = cast(tuple[object, object, object], result)
-    return Advanced(
+    return AdvanceOperands(
         [reader.operand(number, "float") for number in leaves(after)],
         reader.operand(torque, "float"),
         [reader.operand(number, "float") for number in leaves(signals)],

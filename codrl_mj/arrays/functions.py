@@ -13,12 +13,12 @@ from typing import cast
 import numpy as np
 
 from codrl_mj.arrays.scalars import (
-    Backend,
     Kind,
     Number,
     Operand,
     RefusedError,
     Scalar,
+    ScalarBackend,
     describe,
     is_number,
     is_symbolic,
@@ -84,7 +84,7 @@ class Arithmetic:
         backend: receiver of the operations on unknown numbers.
     """
 
-    def __init__(self, backend: Backend) -> None:
+    def __init__(self, backend: ScalarBackend) -> None:
         """Store the back end."""
         self.backend = backend
 

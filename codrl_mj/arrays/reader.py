@@ -2,7 +2,7 @@
 
 Named tuples, function calls, keyword arguments, constants and modules vanish while the source is
 executed. What remains are operations on scalars, branches and loops, which a back end receives:
-see `codrl_mj.arrays.scalars.Backend`.
+see `codrl_mj.arrays.scalars.ScalarBackend`.
 """
 
 import ast
@@ -26,14 +26,14 @@ from codrl_mj.arrays.frames import (
 from codrl_mj.arrays.functions import Arithmetic, refuse_random
 from codrl_mj.arrays.loops import LoopVariables
 from codrl_mj.arrays.scalars import (
-    Backend,
     DryRun,
     Kind,
-    Loop,
     Number,
     Operand,
     RefusedError,
     Scalar,
+    ScalarBackend,
+    ScalarLoop,
     describe,
     is_number,
     kind_of,
@@ -61,7 +61,7 @@ class Reader(Arithmetic):
         backend: receiver of the operations on symbols.
     """
 
-    def __init__(self, backend: Backend) -> None:
+    def __init__(self, backend: ScalarBackend) -> None:
         """Store the back end."""
         super().__init__(backend)
         self._depth = 0
@@ -344,7 +344,7 @@ class Reader(Arithmetic):
         self._dry_run(lambda: variables.settle(condition, body))
         kinds = variables.all_kinds
         results = self.backend.loop(
-            Loop(
+            ScalarLoop(
                 self._operands(variables.numbers(variables.initial), kinds),
                 kinds,
                 lambda operands: self.operand(condition(variables.symbols(operands)), "bool"),
@@ -474,9 +474,9 @@ class Reader(Arithmetic):
             def value(right: ast.expr = right) -> object:
                 return self.value(right, frame)
 
-            other = self._dry_run(value)
+            right_result = self._dry_run(value)
             # A call may contain a loop that ends only if the left operand allows the call.
-            if _is_bool(left) and _is_bool(other) and not contains(right, ast.Call):
+            if _is_bool(left) and _is_bool(right_result) and not contains(right, ast.Call):
                 name = "or" if is_or else "and"
                 result = self.operation(name, "bool", "bool", left, value())
                 continue

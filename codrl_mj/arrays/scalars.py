@@ -39,7 +39,7 @@ class Scalar:
         """Refuse: the value is unknown."""
         self._refuse()
 
-    def __eq__(self, other: object) -> bool:
+    def __eq__(self, value: object) -> bool:
         """Refuse: the value is unknown."""
         self._refuse()
 
@@ -56,7 +56,7 @@ Number = Scalar | bool | int | float | np.generic
 """A symbol, or a number that is known while the source is read."""
 
 
-class Loop(NamedTuple):
+class ScalarLoop(NamedTuple):
     """A loop over variables that are numbers."""
 
     initial: list[Operand]
@@ -71,7 +71,7 @@ class Loop(NamedTuple):
     """Number of iterations; None if only the condition tells."""
 
 
-class Backend(Protocol):
+class ScalarBackend(Protocol):
     """Receiver of the scalar operations, branches and loops of a function."""
 
     def constant(self, value: float, kind: Kind) -> Operand:
@@ -100,7 +100,7 @@ class Backend(Protocol):
     ) -> list[Operand]:
         """Return the results of one of two functions."""
 
-    def loop(self, loop: Loop) -> list[Operand]:
+    def loop(self, loop: ScalarLoop) -> list[Operand]:
         """Return the variables of a loop after its last iteration."""
 
 
@@ -126,7 +126,7 @@ class DryRun:
         """Return nothing for each result; the reader has already read both functions."""
         return [None] * len(kinds)
 
-    def loop(self, loop: Loop) -> list[Operand]:
+    def loop(self, loop: ScalarLoop) -> list[Operand]:
         """Return nothing for each variable; the reader has already read condition and body."""
         return [None] * len(loop.kinds)
 

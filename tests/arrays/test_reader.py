@@ -83,8 +83,8 @@ def loop_over_tuples(a, b):
         total += weight * value
     for index, value in enumerate((a, b)):
         total += index * value
-    for value, other in zip((a, b), (b, 1.0), strict=True):
-        total += value * other
+    for value, weight in zip((a, b), (b, 1.0), strict=True):
+        total += value * weight
     return (total,)
 
 
