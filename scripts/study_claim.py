@@ -11,7 +11,7 @@ import functools
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,13 @@ from codrl_mj.study.axes import FLOORS
 from codrl_mj.study.grid import check_selection
 from codrl_mj.study.pages import TITLES, markdown_table, write_csv, write_page
 from codrl_mj.study.program import Program, main
-from codrl_mj.study.questions import Contrast, Question, Scores, Verdict, judge
+from codrl_mj.study.questions import (
+    Comparison,
+    ComparisonVerdict,
+    Contrast,
+    Scores,
+    judge_comparisons,
+)
 from codrl_mj.study.trials import FAILURE_MARGIN, RUNS, TOTALS, Arm, Grid, StudyResults, Trial
 from codrl_mj.study.trials import run_rows as study_rows
 from codrl_mj.tasks import find_task
@@ -53,7 +59,6 @@ SECONDS: Mapping[str, float] = {
 """Task -> approximate time of a training [s of one core]."""
 IDEAL_KIND, THROUGH_KIND = "ideal", "through"
 PAGE, FOLDER, HYPOTHESES = "claim.md", "claim", "hypotheses.csv"
-BETTER, WORSE, EQUIVALENT, UNDECIDED = "better", "worse", "equivalent", "undecided"
 
 
 def paper_arm(task: str, motor: str) -> PaperArm:
@@ -128,20 +133,10 @@ class Cell(NamedTuple):
         return Contrast(trial(self.task, THROUGH_KIND, test), trial(self.task, IDEAL_KIND, test))
 
     @property
-    def questions(self) -> tuple[Question, Question]:
-        """Hypotheses of a difference (two-sided) and of equivalence."""
+    def comparison(self) -> Comparison:
+        """Comparison with its hypotheses of a difference and of equivalence."""
         name = f"{TITLES[self.task]}, {self.volts:g} V"
-        pair = (self.contrast,)
-        return (
-            Question(f"{name}: difference", "claim", "training through scores higher", pair),
-            Question(
-                f"{name}: equivalence",
-                "claim",
-                "training through scores as high",
-                pair,
-                "equivalent",
-            ),
-        )
+        return Comparison(name, "claim", "training through", self.contrast)
 
 
 def cells() -> tuple[Cell, ...]:
@@ -153,56 +148,13 @@ def cells() -> tuple[Cell, ...]:
     )
 
 
-class Judged(NamedTuple):
-    """Comparison with its verdicts."""
-
-    cell: Cell
-    difference: Verdict
-    equivalence: Verdict
-
-    @property
-    def outcome(self) -> str:
-        """Return the verdict on the comparison.
-
-        A difference that is surely below the margin counts as equivalent.
-        """
-        if np.isnan(self.difference.p):
-            return "not judged"
-        if self.equivalence.outcome == "yes":
-            return EQUIVALENT
-        return {"yes": BETTER, "the other way": WORSE}.get(self.difference.outcome, UNDECIDED)
-
-
-def judge_cells(collected: StudyResults, scores: Scores) -> list[Judged]:
-    """Judge all comparisons together, by Holm's method; none before all results exist."""
-    every_cell = cells()
-    questions = [question for cell in every_cell for question in cell.questions]
-    grid = collected.grid
-    complete = all(
-        len(collected.evaluations[test.name]) == len(grid.seeds_of(test.arm))
-        for test in grid.trials
-    )
-    verdicts = judge(
-        scores,
-        questions,
-        primary=True,
-        min_policies=2 if complete else sys.maxsize,
-    )
-    return [
-        Judged(cell, *pair)
-        for cell, pair in zip(
-            every_cell, zip(verdicts[::2], verdicts[1::2], strict=True), strict=True
-        )
-    ]
-
-
 def conclude(outcomes: Sequence[str]) -> str:
     """Return the verdict on the claim that training through is better in every comparison."""
     if "not judged" in outcomes:
         return "not judged"
-    if all(outcome == BETTER for outcome in outcomes):
+    if all(outcome == "better" for outcome in outcomes):
         return "confirmed"
-    if any(outcome in (WORSE, EQUIVALENT) for outcome in outcomes):
+    if any(outcome in ("worse", "equivalent") for outcome in outcomes):
         return "not confirmed"
     return "open"
 
@@ -213,9 +165,11 @@ def conclusion_text(outcomes: Sequence[str]) -> str:
     return f"**{conclude(outcomes)}** ({', '.join(f'{n} {name}' for name, n in counts.items())})"
 
 
-def result_table(collected: StudyResults, scores: Scores, judged: Sequence[Judged]) -> str:
+def result_table(
+    collected: StudyResults, scores: Scores, judged: Sequence[ComparisonVerdict]
+) -> str:
     """Return the table of all tests; those that are not compared have no verdict."""
-    judged_by_test = {item.cell.contrast.treatment.name: item for item in judged}
+    judged_by_test = {item.comparison.contrast.treatment.name: item for item in judged}
     rows = []
     for task in SETTINGS:
         for test in evaluation_envs(task):
@@ -227,7 +181,7 @@ def result_table(collected: StudyResults, scores: Scores, judged: Sequence[Judge
                     *(_score_text(list(scores.by_seed(half).values())) for half in pair),
                     *(_mean_text(collected, half, "success", 100.0) for half in pair),
                     *(_mean_text(collected, half, "saturated_percent", 1.0) for half in pair),
-                    *(("–",) * 4 if item is None else _verdict_texts(item)),
+                    *(("–",) * 4 if item is None else item.table_cells),
                 ]
             )
     pairs = ("score; failed", "success [%]", "saturated steps [%]")
@@ -251,17 +205,6 @@ def _mean_text(collected: StudyResults, test: Trial, measure: str, factor: float
     return f"{factor * float(np.mean(values)):.3g}" if values else "–"
 
 
-def _verdict_texts(item: Judged) -> tuple[str, ...]:
-    """Format the difference, both corrected p-values and the verdict of a comparison."""
-    interval = item.difference.effect
-    effect = f"{interval.mean:+.3f} [{interval.low:+.3f}, {interval.high:+.3f}]"
-    p_values = [
-        "–" if np.isnan(verdict.p) else f"{verdict.corrected_p:.2g}"
-        for verdict in (item.difference, item.equivalence)
-    ]
-    return "–" if np.isnan(interval.mean) else effect, *p_values, item.outcome
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ClaimStudy(Program):
     """Run or resume the test of the paper's claim, and write its rows and page.
@@ -269,6 +212,8 @@ class ClaimStudy(Program):
     Finished results are not computed again: docs/studies.md. Example: python scripts/study_claim.py
     --dry-run
     """
+
+    PUBLISH_EACH_TRAINING: ClassVar[bool] = True
 
     root: Path = Path("runs/claim")
     """Folder of the run folders."""
@@ -293,39 +238,24 @@ class ClaimStudy(Program):
     def _seeds(self, training_arm: Arm) -> range:
         return range(self.seeds * SEEDS_FACTOR.get(training_arm.task, 1))
 
-    def _training_grid(self, arm_name: str, seed: int) -> Grid:
-        """Return the grid of a single training and its tests."""
-
-        def seeds_of(_: Arm) -> range:
-            return range(seed, seed + 1)
-
-        grid = self.grid
-        tests = tuple(test for test in grid.trials if test.arm.name == arm_name)
-        return dataclasses.replace(grid, trials=tests, seeds_of=seeds_of)
-
-    def run(self) -> int:
-        """Compute missing results and write the page; return 1 if anything failed.
-
-        One job publishes the rows of each training when it is tested, instead of those of a seed.
-        """
-        if self.workers.cores == 1 and not (self.dry_run or self.only_page):
-            for name, seed in self.grid.cells:
-                part = self._training_grid(name, seed)
-                part.compute(self.workers, self.accept_changes, on_seed=self.publish)
-        return super().run()
-
     def write(self) -> tuple[Iterable[Path], Mapping[str, str]]:
         """Write rows, verdicts and page of all existing results; return files and failures."""
         collected = dataclasses.replace(self, tasks=tuple(SETTINGS)).grid.collect()
         scores = Scores(collected, FLOORS, [trial(task, IDEAL_KIND, "ideal") for task in SETTINGS])
-        judged = judge_cells(collected, scores)
+        judged = judge_comparisons(
+            scores, [cell.comparison for cell in cells()], collected.complete
+        )
         folder, page = self.out / FOLDER, self.out / PAGE
         write_csv(folder / RUNS, list(study_rows(collected, scores.by_seed)))
         verdicts = [verdict for item in judged for verdict in item[1:]]
         write_csv(folder / HYPOTHESES, [verdict.row(len(verdicts)) for verdict in verdicts])
         write_json(folder / TOTALS, collected.totals._asdict())
         totals, outcomes = collected.totals, [item.outcome for item in judged]
-        at_trained_voltage = [item.outcome for item in judged if item.cell.volts == VOLTAGES[0]]
+        at_trained_voltage = [
+            item.outcome
+            for cell, item in zip(cells(), judged, strict=True)
+            if cell.volts == VOLTAGES[0]
+        ]
         parts = [
             "# Does training through the motor improve the paper's results?\n",
             result_table(collected, scores, judged),

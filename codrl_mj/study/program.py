@@ -5,6 +5,7 @@ import dataclasses
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import tyro
 from rich.console import Console
@@ -32,6 +33,9 @@ class Program(Checked, abc.ABC):
     Raises:
         ValueError: a number is out of bounds.
     """
+
+    PUBLISH_EACH_TRAINING: ClassVar[bool] = False
+    """True if one job publishes the rows of each training, instead of those of a seed."""
 
     root: Path
     """Folder of the run folders."""
@@ -83,6 +87,10 @@ class Program(Checked, abc.ABC):
             # The pages need matplotlib: report that it is missing before hours of work, not after.
             import matplotlib  # noqa: F401
 
+            if self.PUBLISH_EACH_TRAINING and workers.cores == 1:
+                for name, seed in grid.cells:
+                    part = grid.restricted_to({name: range(seed, seed + 1)})
+                    part.compute(workers, self.accept_changes, on_seed=self.publish)
             compute(grid, workers, self.accept_changes, self.publish)
         files, failures = self.write()
         for file in files:

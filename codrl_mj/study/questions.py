@@ -5,6 +5,7 @@ scores.
 """
 
 import dataclasses
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
@@ -20,6 +21,7 @@ from codrl_mj.study.inference import (
     permutation_p,
     runs_needed,
 )
+from codrl_mj.study.pages import markdown_table
 from codrl_mj.study.trials import StudyResults, Trial
 
 MARGIN = 0.05
@@ -61,6 +63,36 @@ class Question:
     """Pooled contrasts, with equal weights."""
     kind: Literal["better", "equivalent"] = "better"
     """`better`: treatments score higher; `equivalent`: they differ by less than `MARGIN`."""
+
+
+class Comparison(NamedTuple):
+    """Contrast that is tested for a difference, on both sides, and for equivalence."""
+
+    name: str
+    """Unique name within the study."""
+    section: str
+    """Section of the page."""
+    treatment: str
+    """Text that names the treatment, such as `training through`."""
+    contrast: Contrast
+    """The two compared trials."""
+
+    @property
+    def questions(self) -> tuple[Question, Question]:
+        """Hypotheses of a difference and of equivalence."""
+        pair = (self.contrast,)
+        return (
+            Question(
+                f"{self.name}: difference", self.section, f"{self.treatment} scores higher", pair
+            ),
+            Question(
+                f"{self.name}: equivalence",
+                self.section,
+                f"{self.treatment} scores as high",
+                pair,
+                "equivalent",
+            ),
+        )
 
 
 class Scores:
@@ -199,6 +231,72 @@ class Verdict(NamedTuple):
             "seeds_to_close": self.seeds_to_close(questions) if self.outcome == "open" else None,
             "compared": "; ".join(pair.name for pair in question.contrasts),
         }
+
+
+class ComparisonVerdict(NamedTuple):
+    """Comparison with its two verdicts."""
+
+    comparison: Comparison
+    """The comparison."""
+    difference: Verdict
+    """Verdict on a difference of either sign."""
+    equivalence: Verdict
+    """Verdict on a difference below `MARGIN`."""
+
+    @property
+    def outcome(self) -> Literal["better", "worse", "equivalent", "undecided", "not judged"]:
+        """Verdict on the treatment; a difference that is surely below the margin is equivalent."""
+        if np.isnan(self.difference.p):
+            return "not judged"
+        if self.equivalence.outcome == "yes":
+            return "equivalent"
+        if self.difference.outcome == "yes":
+            return "better"
+        return "worse" if self.difference.outcome == "the other way" else "undecided"
+
+    @property
+    def table_cells(self) -> tuple[str, str, str, str]:
+        """Texts of the difference with its interval, both corrected p-values and the outcome."""
+        interval = self.difference.effect
+        effect_text = f"{interval.mean:+.3f} [{interval.low:+.3f}, {interval.high:+.3f}]"
+        p_difference, p_equivalence = (
+            "–" if np.isnan(verdict.p) else f"{verdict.corrected_p:.2g}"
+            for verdict in (self.difference, self.equivalence)
+        )
+        return (
+            "–" if np.isnan(interval.mean) else effect_text,
+            p_difference,
+            p_equivalence,
+            self.outcome,
+        )
+
+
+def judge_comparisons(
+    scores: Scores, comparisons: Sequence[Comparison], complete: bool
+) -> list[ComparisonVerdict]:
+    """Test comparisons and correct all their p-values together, by Holm's method.
+
+    Args:
+        scores: scores of the study.
+        comparisons: all comparisons of the study.
+        complete: True if all planned results exist; before, no p-value is reported.
+    """
+    questions = [question for comparison in comparisons for question in comparison.questions]
+    verdicts = judge(scores, questions, primary=True, min_policies=2 if complete else sys.maxsize)
+    return [
+        ComparisonVerdict(comparison, difference, equivalence)
+        for comparison, difference, equivalence in zip(
+            comparisons, verdicts[::2], verdicts[1::2], strict=True
+        )
+    ]
+
+
+def comparison_table(verdicts: Sequence[ComparisonVerdict]) -> str:
+    """Return the Markdown table of comparisons with their verdicts."""
+    header = ("comparison", "difference [95 %]", "p, difference", "p, equivalence", "verdict")
+    return markdown_table(
+        header, ([verdict.comparison.name, *verdict.table_cells] for verdict in verdicts)
+    )
 
 
 def judge(

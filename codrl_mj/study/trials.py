@@ -78,11 +78,22 @@ class Trial:
     """Name of the test, unique within the task."""
     env: EnvConfig
     """Environment of the test, but with the actions and observations of the training."""
+    seeds: range | None = None
+    """Seeds of the tested policies; None: all seeds of the arm."""
+    episodes: int | None = None
+    """Number of episodes, >= 1; None: that of the grid."""
+    first_seed: int = EVALUATION_SEED
+    """Seed of the first episode; another value gives other initial states."""
 
     @property
     def name(self) -> str:
         """Unique name of the trial."""
         return f"{self.arm.name} on {self.test}"
+
+    @property
+    def definition(self) -> tuple[EnvConfig, range | None, int | None, int]:
+        """Environment, policies, number of episodes and first seed; equal for equal tests."""
+        return self.env, self.seeds, self.episodes, self.first_seed
 
 
 class Cost(NamedTuple):
@@ -141,7 +152,7 @@ class Grid:
         """Validate."""
         for kind, definitions in (
             ("arm", {(trial.arm.name, repr(trial.arm.config)) for trial in self.trials}),
-            ("trial", {(trial.name, repr(trial.env)) for trial in self.trials}),
+            ("trial", {(trial.name, repr(trial.definition)) for trial in self.trials}),
         ):
             duplicates = [
                 name
@@ -152,6 +163,11 @@ class Grid:
                 raise ValueError(
                     f"{kind} {duplicates[0]!r}: is the name of several: give each a different name"
                 )
+
+    def restricted_to(self, seeds: Mapping[str, range]) -> "Grid":
+        """Return the grid of some arms, each with some of its seeds, by the name of the arm."""
+        trials = tuple(trial for trial in self.trials if trial.arm.name in seeds)
+        return dataclasses.replace(self, trials=trials, seeds_of=lambda arm: seeds[arm.name])
 
     @functools.cached_property
     def arms(self) -> tuple[Arm, ...]:
@@ -178,10 +194,14 @@ class Grid:
         folders = self.folders
         return {
             (trial.name, seed): PolicyTest(
-                folders[trial.arm.name, seed], trial.env, self.episodes, EVALUATION_SEED
+                folders[trial.arm.name, seed],
+                trial.env,
+                self.episodes if trial.episodes is None else trial.episodes,
+                trial.first_seed,
             )
             for trial in self.trials
             for seed in self.seeds_of(trial.arm)
+            if trial.seeds is None or seed in trial.seeds
         }
 
     @functools.cached_property
@@ -385,6 +405,11 @@ class StudyResults:
     """Name -> error, for trainings and tests in `missing` that have failed."""
     totals: Totals
     """Totals of the trainings."""
+
+    @property
+    def complete(self) -> bool:
+        """True if every test of the grid has a result."""
+        return sum(map(len, self.evaluations.values())) == len(self.grid.policy_tests)
 
     def scores(self, trial: Trial, measure: str = "returns") -> dict[int, float]:
         """Return a measure of a trial's policies by seed, as a number; see `to_scalar`.
