@@ -216,10 +216,10 @@ class ChosenScores(questions.Scores):
         return {group: judged[seed] for group, seed in self.choices(task, rule).items()}
 
 
-def comparisons() -> list[questions.Comparison]:
+def comparisons() -> list[questions.TrialComparison]:
     """Return a comparison for each statement and motor."""
     return [
-        questions.Comparison(
+        questions.TrialComparison(
             f"{name}, {pages.TITLES[task]}",
             name,
             treatment.name,

@@ -24,10 +24,10 @@ from codrl_mj.study.grid import check_selection
 from codrl_mj.study.pages import TITLES, markdown_table, write_csv, write_page
 from codrl_mj.study.program import Program, main
 from codrl_mj.study.questions import (
-    Comparison,
     ComparisonVerdict,
     Contrast,
     Scores,
+    TrialComparison,
     judge_comparisons,
 )
 from codrl_mj.study.trials import FAILURE_MARGIN, RUNS, TOTALS, Arm, Grid, StudyResults, Trial
@@ -133,10 +133,10 @@ class Cell(NamedTuple):
         return Contrast(trial(self.task, THROUGH_KIND, test), trial(self.task, IDEAL_KIND, test))
 
     @property
-    def comparison(self) -> Comparison:
+    def comparison(self) -> TrialComparison:
         """Comparison with its hypotheses of a difference and of equivalence."""
         name = f"{TITLES[self.task]}, {self.volts:g} V"
-        return Comparison(name, "claim", "training through", self.contrast)
+        return TrialComparison(name, "claim", "training through", self.contrast)
 
 
 def cells() -> tuple[Cell, ...]:

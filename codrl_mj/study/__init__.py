@@ -12,7 +12,17 @@ from codrl_mj.study.inference import (
 from codrl_mj.study.pages import markdown_table, read_conclusions, read_csv, write_csv, write_page
 from codrl_mj.study.parallel import Workers
 from codrl_mj.study.program import Program, main
-from codrl_mj.study.questions import Contrast, Question, Scores, Verdict, judge
+from codrl_mj.study.questions import (
+    ComparisonVerdict,
+    Contrast,
+    Question,
+    Scores,
+    TrialComparison,
+    Verdict,
+    comparison_table,
+    judge,
+    judge_comparisons,
+)
 from codrl_mj.study.trials import Arm, Grid, StudyResults, Trial, run_rows, trial_rows
 
 __all__ = [
@@ -22,10 +32,14 @@ __all__ = [
     "Workers",
     "StudyResults",
     "Contrast",
+    "TrialComparison",
     "Question",
     "Scores",
     "Verdict",
+    "ComparisonVerdict",
     "judge",
+    "judge_comparisons",
+    "comparison_table",
     "Program",
     "main",
     "run_rows",

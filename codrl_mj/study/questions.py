@@ -65,7 +65,7 @@ class Question:
     """`better`: treatments score higher; `equivalent`: they differ by less than `MARGIN`."""
 
 
-class Comparison(NamedTuple):
+class TrialComparison(NamedTuple):
     """Contrast that is tested for a difference, on both sides, and for equivalence."""
 
     name: str
@@ -236,7 +236,7 @@ class Verdict(NamedTuple):
 class ComparisonVerdict(NamedTuple):
     """Comparison with its two verdicts."""
 
-    comparison: Comparison
+    comparison: TrialComparison
     """The comparison."""
     difference: Verdict
     """Verdict on a difference of either sign."""
@@ -272,7 +272,7 @@ class ComparisonVerdict(NamedTuple):
 
 
 def judge_comparisons(
-    scores: Scores, comparisons: Sequence[Comparison], complete: bool
+    scores: Scores, comparisons: Sequence[TrialComparison], complete: bool
 ) -> list[ComparisonVerdict]:
     """Test comparisons and correct all their p-values together, by Holm's method.
 

@@ -38,7 +38,8 @@ from study_choose import (
 )
 from tests.matrix import matrix_params
 
-PLAN = Path(__file__).parents[2] / "docs/results/choose_plan.md"
+RESULTS = Path(__file__).parents[2] / "docs/results"
+PLAN = RESULTS / "choose_plan.md"
 # Scores by the place of an ideal-trained policy in its group: on the true motor, on the wrong one,
 # on ideal forces in the choosing test. A policy trained through the motor has the last five.
 RISING, BEST_IS_THIRD = (0.1, 0.2, 0.3, 0.4, 0.5), (0.1, 0.2, 0.9, 0.3, 0.4)
@@ -362,6 +363,27 @@ def test_the_study_is_that_of_the_plan():
         f" {high['coulomb_friction']} friction, {high['gear_efficiency']} efficiency;"
         f" {sum(error['delay'] > 0 for error in errors)} have the delay"
     ) in plan
+
+
+def test_the_pages_quote_what_a_choice_on_ideal_forces_costs():
+    """The best of five by the score on ideal forces, over all groups of the first study's rows."""
+    rows = [
+        row
+        for row in read_csv(RESULTS / "actuators" / RUNS)
+        if (row["task"], row["trained"]) == ("furuta", "ideal")
+    ]
+    ideal, weak = (
+        {row["seed"]: float(row["score"]) for row in rows if row["tested"] == test}
+        for test in ("ideal", "weakness 0.55")
+    )
+    chosen = [weak[max(five, key=ideal.get)] for five in itertools.combinations(ideal, GROUP)]
+    assert len(chosen) == math.comb(20, GROUP)
+    for page in (RESULTS / "actuators.md", RESULTS.parent / "my_policy_fails.md"):
+        text = " ".join(page.read_text().split())
+        assert "with 55 % of the force missing, the best of five" in text
+        assert f"{np.mean(chosen):.2f}" == "0.14"
+        assert re.search(r"by that score (keeps|kept) 0\.14 ", text)
+        assert f"a random one {np.mean(list(weak.values())):.2f}" in text
 
 
 def test_a_tiny_study_trains_chooses_and_resumes(tmp_path, monkeypatch, capsys):
