@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from actuator_study.arms import DRAWN
+from actuator_study.by_task import BY_TASK, RESTS, TaskVerdict, judge_by_task, rests_text
 from actuator_study.figures import dots
 from actuator_study.page import (
     HYPOTHESES,
     TRIALS,
+    UNDECIDED,
     decided_table,
     effect_text,
     p_text,
@@ -30,7 +32,7 @@ from codrl_mj.study.pages import (
     write_page,
 )
 from codrl_mj.study.questions import MARGIN, Scores, Verdict, judge
-from codrl_mj.study.trials import FAILURE_MARGIN, RUNS, StudyResults, Trial
+from codrl_mj.study.trials import FAILURE_MARGIN, RUNS, StudyResults, Trial, run_rows
 from codrl_mj.tasks import find_task
 from insurance_study.learning import LEARNING, learning_rows, still_rising
 from insurance_study.questions import (
@@ -39,10 +41,13 @@ from insurance_study.questions import (
     SEVERITIES,
     TASKS,
     home,
+    needs_new_policies,
     primary,
     reach,
     secondary,
+    trained_again,
     trial_at,
+    trials,
 )
 
 PAGE, FOLDER, FIGURE = "insurance.md", "insurance", "insured.svg"
@@ -127,7 +132,11 @@ def write(collected: StudyResults, out: Path) -> list[Path]:
     scores = Scores(collected, FLOORS, [ideal_trial(ideal_arm(task)) for task in TASKS])
     primary_verdicts = judge(scores, primary(), primary=True, min_policies=PLANNED)
     secondary_verdicts = judge(scores, secondary(), min_policies=PLANNED)
-    tables = write_tables(folder, collected, scores, primary_verdicts, secondary_verdicts)
+    by_task = judge_by_task(scores, primary_verdicts, min_policies=PLANNED)
+    rows = _run_rows(collected, scores)
+    tables = write_tables(
+        folder, collected, scores, rows, primary_verdicts, secondary_verdicts, by_task
+    )
     spans = {task: ceiling - FLOORS[task] for task, ceiling in scores.ceilings.items()}
     learned = learning_rows(collected, folder / LEARNING)
     write_csv(folder / LEARNING, learned)
@@ -136,11 +145,12 @@ def write(collected: StudyResults, out: Path) -> list[Path]:
         "# What makes a policy robust to its motor?\n",
         read_conclusions(out / PAGE),
         _things(collected, scores),
-        _kinds(collected, scores),
         f"![Scores by kind of training]({FOLDER}/{FIGURE})\n",
-        _verdicts(primary_verdicts, scores),
+        _task_verdicts(by_task),
         _secondary(secondary_verdicts),
-        _method(collected, *still_rising(learned, spans, MARGIN)),
+        _verdicts(primary_verdicts, by_task),
+        _kinds(collected, scores),
+        _method(collected, rows, *still_rising(learned, spans, MARGIN)),
     ]
     write_page(out / PAGE, parts)
     return [out / PAGE, folder / FIGURE, folder / LEARNING, *tables]
@@ -262,71 +272,95 @@ def draw(path: Path, scores: Scores) -> None:
     save_figure(figure, path)
 
 
-def _verdicts(verdicts: Sequence[Verdict], scores: Scores) -> str:
+def _task_verdicts(by_task: Sequence[TaskVerdict]) -> str:
+    """Return the section with the verdict on every hypothesis on every task."""
+    statements: dict[str, list[str]] = {}
+    for verdict in by_task:
+        question = verdict.question
+        statements.setdefault(f"{question.name} | {question.statement}", []).append(verdict.text)
+    header = ["", "hypothesis", *(TITLES[task] for task in TASKS)]
+    rows = [[*name.split(" | "), *texts] for name, texts in statements.items()]
+    return f"""## Task by task
+
+The ten hypotheses of the plan, each on one task. A cell has the verdict and the difference of the mean scores with its
+95 % interval. The plan has only the verdicts [that pool the tasks](insurance.md#the-ten-hypotheses). These {len(by_task)}
+were added later; their false discovery rate is 5 %. *The other way* means a decided difference of the opposite sign.
+
+{markdown_table(header, rows)}"""
+
+
+def _verdicts(verdicts: Sequence[Verdict], by_task: Sequence[TaskVerdict]) -> str:
     rows = []
     for verdict in verdicts:
-        statement = verdict.question.statement
+        name, statement = verdict.question.name, verdict.question.statement
         tested, planned = verdict.strata
         if tested < planned:
             statement += f" ({tested} of {planned} comparisons have runs)"
         judged = [
             verdict.outcome,
             effect_text(verdict),
-            _by_task(verdict, scores),
             p_text(verdict.corrected_p),
+            rests_text(name, by_task),
         ]
-        rows.append([verdict.question.name, *judged, str(min(verdict.runs)), statement])
-    header = ["", "holds", "effect [95 %]", "by task", "corrected p", "policies", "hypothesis"]
+        rows.append([name, *judged, str(min(verdict.runs)), statement])
+    header = ["", "holds", "effect [95 %]", "corrected p", "rests on", "policies", "hypothesis"]
     return f"""## The ten hypotheses
 
-A hypothesis is judged only with {PLANNED} policies of every kind. The column *by task* has the effects on {_TASKS}.
+The verdicts of the plan, pooled over the three tasks. A hypothesis is judged only with {PLANNED} policies of every kind.
+{RESTS}
 
 {markdown_table(header, rows)}"""
-
-
-_TASKS = ", ".join(TITLES[task] for task in TASKS)
-
-
-def _by_task(verdict: Verdict, scores: Scores) -> str:
-    """Return the mean effect on each task, over the contrasts that have runs."""
-    texts = []
-    for task in TASKS:
-        pairs = [
-            pair
-            for pair in verdict.question.contrasts
-            if pair.treatment.arm.task == task and scores.stratum([pair])
-        ]
-        stratum = scores.stratum(pairs) if pairs else None
-        texts.append(
-            "–"
-            if stratum is None
-            else f"{np.mean(stratum.treatment) - np.mean(stratum.control):+.2f}"
-        )
-    return ", ".join(texts)
 
 
 def _secondary(verdicts: Sequence[Verdict]) -> str:
     if all(np.isnan(verdict.p) for verdict in verdicts):
         return f"The {len(verdicts)} secondary comparisons, each of one task, are not judged yet.\n"
-    return f"""All secondary comparisons are of one task each. Their false discovery rate is 5 %:
+    return f"""All secondary comparisons of the plan are of one task and one severity each. Their false discovery rate is 5 %.
+{UNDECIDED}
 
 {decided_table(verdicts, SECTION_TITLES)}"""
 
 
-def _method(collected: StudyResults, rising: Sequence[str], count: int) -> str:
+def _run_rows(collected: StudyResults, scores: Scores) -> list[dict[str, object]]:
+    """Return a row for every policy and test; `trained_again` marks policies as explained there."""
+    again = {trial.name for trial in trials() if trained_again(trial)}
+    return [
+        row | {"trained_again": f"{row['task']}: {row['trained']} on {row['tested']}" in again}
+        for row in run_rows(collected, scores.by_seed)
+    ]
+
+
+def _method(
+    collected: StudyResults, rows: Sequence[Mapping[str, object]], rising: Sequence[str], count: int
+) -> str:
     totals, num_planned = collected.totals, len(collected.grid.cells)
     num_tested = sum(map(len, collected.evaluations.values()))
     num_tests = len(collected.grid.policy_tests)
+    new = {trial.arm.name for trial in trials() if needs_new_policies(trial)}
+    num_new = sum(name in new for name, _ in collected.folders)
+    again = [row for row in rows if row["trained_again"]]
+    num_again = len({row["run"] for row in again})
     text = f"""The study follows [its plan](insurance_plan.md), with the scores and tests of [the first
-study](actuators.md). It has {num_tested} of {num_tests} tests of {num_planned} policies
-({totals.seconds / 3600:.1f} hours of one core in the available runs).
-`scripts/study_insurance.py` ([how](../studies.md)) writes this page and four tables: [policies]({FOLDER}/{RUNS}),
-[trials]({FOLDER}/{TRIALS}) with medians and failures, [comparisons]({FOLDER}/{HYPOTHESES}), and [mean returns in each
-tenth of a training]({FOLDER}/{LEARNING}). Of {count} kinds of training {len(rising)} had not leveled off
-({"; ".join(rising) or "none"}). Their mean return in the last tenth is more than {MARGIN:g} of the span above that in
-the eighth."""
+study](actuators.md). It has {num_tested} of {num_tests} tests of {num_planned} policies. {num_new} of these policies
+were trained for it, and {num_again} of the first study were trained again. The time of {sum(totals.codes.values())} of
+these {num_new + num_again} trainings is known: {totals.seconds / 3600:.1f} hours of one core.
+`scripts/study_insurance.py` ([how](../studies.md)) writes this page and five tables: [policies]({FOLDER}/{RUNS}),
+[trials]({FOLDER}/{TRIALS}) with medians and failures, [comparisons]({FOLDER}/{HYPOTHESES}),
+[hypotheses by task]({FOLDER}/{BY_TASK}), and [mean returns in each tenth of a training]({FOLDER}/{LEARNING}). Of
+{count} kinds of training {len(rising)} had not leveled off ({"; ".join(rising) or "none"}). Their mean return in the last
+tenth is more than {MARGIN:g} of the span above that in the eighth."""
+    repeated = f"""**Policies that were trained again.** The run folders of the first study are gone. To test its policies
+on ideal forces and at other severities, {num_again} of them were trained again, with the same settings and seeds. Rounding
+differs between machines, so these are other policies, although their runs have the same names, which follow from the
+settings. {RUNS} marks their {len(again)} rows in the column `trained_again`. The unmarked rows of these runs, at the trained
+severity, are those of the first study. The scores of the retrained policies at the trained severity were not kept, so
+that nobody can check if the two sets agree there. Any comparison of a policy's score at the trained severity with its
+score elsewhere compares two policies."""
     return (
         "## How it was measured\n\n"
-        + textwrap.fill(" ".join(text.split()), 120, break_long_words=False)
+        + "\n\n".join(
+            textwrap.fill(" ".join(part.split()), 120, break_long_words=False)
+            for part in ([text, repeated] if again else [text])
+        )
         + "\n"
     )

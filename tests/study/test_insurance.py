@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from actuator_study.arms import DRAWN
+from actuator_study.by_task import judge_by_task
 from codrl_mj.actuators import Lag
 from codrl_mj.disturbances import Disturbances
-from codrl_mj.study.axes import AXES, FLOORS, study_env, timestep
+from codrl_mj.study.axes import AXES, FLOORS, ideal_arm, ideal_trial, study_env, timestep
 from codrl_mj.study.evidence import Evidence
 from codrl_mj.study.pages import read_csv, write_csv
+from codrl_mj.study.questions import Scores, judge
+from codrl_mj.study.trials import Grid
 from codrl_mj.tasks import find_task
 from insurance_study.learning import still_rising
 from insurance_study.page import PLANNED
@@ -212,9 +215,62 @@ def test_the_page_states_the_true_results(written):
     assert "| delay 600 ms (400 ms) | 0.50; 4; " in page.replace("\u00a0", " ")
     (row,) = (line for line in page.splitlines() if line.startswith("| friction 0.2 N·m | "))
     assert [cell[:5] for cell in row.split(" | ")[1:]] == ["0.50;", "**0.9", "–", "0.70;", "0.50;"]
-    (i10,) = (line for line in page.splitlines() if line.startswith("| I10 |"))
-    assert " | -0.20, -0.20, -0.20 | " in i10
+    by_task, pooled = (line for line in page.splitlines() if line.startswith("| I10 |"))
+    assert by_task.count(" | the other way, -0.20 [-0.23, -0.17]") == len(TASKS)
+    assert pooled.split(" | ")[4] == "–"  # It rests on no single task.
     assert "not judged" not in page
+
+
+@pytest.mark.parametrize(
+    ("protected", "expected"),
+    [(("pendulum",), {"pendulum"}), (("pendulum", "acrobot"), set()), (TASKS, set())],
+)
+def test_a_verdict_rests_on_a_task_without_which_it_fails(tmp_path, protected, expected):
+    """Random actuators gain 0.3 on the named tasks, and nothing on the others."""
+    (question,) = (question for question in primary() if question.name == "I2")
+    homes = [ideal_trial(ideal_arm(task)) for task in TASKS]
+    tested = [trial for pair in question.contrasts for trial in pair]
+    planned = tuple({trial.name: trial for trial in (*homes, *tested)}.values())
+    grid = Grid(tmp_path, planned, lambda _: range(4))
+
+    def score(trial, seed):
+        gain = 0.3 * (trial.arm.name.endswith(": random") and trial.arm.task in protected)
+        level = 1.0 if trial.test == "ideal" else 0.5 + gain
+        return FLOORS[trial.arm.task] + 100.0 * level + [-2.0, 2.0, 1.0, -1.0][seed]
+
+    pretend(grid, score)
+    scores = Scores(grid.collect(), FLOORS, homes)
+    pooled = judge(scores, [question], primary=True)
+    assert [verdict.outcome for verdict in pooled] == ["yes"]
+    by_task = judge_by_task(scores, pooled)
+    assert {verdict.task for verdict in by_task if verdict.is_needed} == expected
+    effects = {verdict.task: verdict.verdict.effect.mean for verdict in by_task}
+    assert effects == pytest.approx({task: 0.3 * (task in protected) for task in TASKS}, abs=1e-9)
+    others = {verdict.task: verdict.others.mean for verdict in by_task}
+    assert others == pytest.approx(
+        {task: 0.15 * len(set(protected) - {task}) for task in TASKS}, abs=1e-9
+    )
+
+
+def test_published_rows_tell_policies_that_were_trained_again_from_the_first_study_s():
+    first = {
+        (row["task"], row["trained"], row["tested"], row["seed"]): (row["run"], row["returns"])
+        for row in read_csv(RESULTS / "actuators" / "runs.csv")
+    }
+    again, shared = [], 0
+    for row in read_csv(RESULTS / "insurance" / "runs.csv"):
+        key = row["task"], row["trained"], row["tested"], row["seed"]
+        if row["trained_again"] == "True":
+            assert key not in first
+            again.append(row)
+        elif key in first:
+            assert first[key] == (row["run"], row["returns"])
+            shared += 1
+    assert {row["run"] for row in again} <= {run for run, _ in first.values()}
+    counts = len(again), len({row["run"] for row in again}), shared
+    assert counts == (1180, 400, 1480)
+    page = " ".join((RESULTS / "insurance.md").read_text().split())
+    assert "marks their 1180 rows in the column `trained_again`" in page
 
 
 def test_questions_with_fewer_policies_than_planned_are_not_judged(written, tmp_path):
