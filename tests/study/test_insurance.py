@@ -1,6 +1,7 @@
 """The study of robust training: its actuator against the package's, its arms and its page."""
 
 import itertools
+import json
 import shutil
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from actuator_study.arms import DRAWN
 from actuator_study.by_task import judge_by_task
+from actuator_study.study import ActuatorStudy
 from codrl_mj.actuators import Lag
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.study.axes import AXES, FLOORS, ideal_arm, ideal_trial, study_env, timestep
@@ -271,6 +273,30 @@ def test_published_rows_tell_policies_that_were_trained_again_from_the_first_stu
     assert counts == (1180, 400, 1480)
     page = " ".join((RESULTS / "insurance.md").read_text().split())
     assert "marks their 1180 rows in the column `trained_again`" in page
+
+
+def test_the_overview_counts_trainings_and_hours_as_the_tables_do():
+    overview = " ".join((RESULTS / "README.md").read_text().split())
+    totals = {
+        study: json.loads((RESULTS / study / "totals.json").read_text())
+        for study in ("actuators", "insurance")
+    }
+    hours = {study: f"{total['seconds'] / 3600:.1f} hours" for study, total in totals.items()}
+    first = {row["run"] for row in read_csv(RESULTS / "actuators" / "runs.csv")}
+    rows = read_csv(RESULTS / "insurance" / "runs.csv")
+    again = {row["run"] for row in rows if row["trained_again"] == "True"}
+    new = {row["run"] for row in rows} - first
+    trained, planned = totals["actuators"]["trainings"], len(ActuatorStudy().grid.cells)
+    assert (
+        f"The first study took {hours['actuators']} for {trained} of its {planned} planned"
+        f" trainings, of which {len(first)} were tested." in overview
+    )
+    assert (
+        f"The second study has {len(new) + len(again)} trainings: {len(new)} for its own kinds of"
+        f" training, and {len(again)} to repeat policies of the first study. The time of"
+        f" {sum(totals['insurance']['codes'].values())} of them is known, {hours['insurance']}."
+        in overview
+    )
 
 
 def test_questions_with_fewer_policies_than_planned_are_not_judged(written, tmp_path):
