@@ -3,7 +3,8 @@
 An agent learns each environment on ideal actuators. Motors are chosen for the demands of the first
 seed's policy; smaller ones are the strongest that lack something. Agents then learn through both,
 and every policy is tested on all three. Interrupted trainings are resumed. Writes
-docs/worked_examples.csv and prints its means; `--steps 0.01` is a quick trial.
+docs/worked_examples.csv, and its means into docs/worked_examples.md; `--steps 0.01` is a quick
+trial.
 """
 
 import argparse
@@ -39,6 +40,8 @@ EXAMPLES: dict[str, tuple[str, int]] = {
     "cheetah": ("HalfCheetah-v5", 20_000),
     "servo arm": ("servo_arm:ServoArm-v0", 15_000),
 }
+WRITTEN = "<!-- written by scripts/worked_examples.py -->"
+"""Mark on the page, after which the script writes."""
 THROUGH = ("ideal", "chosen", "smaller")
 EPISODES, TEST_SEED = 20, 2_000_000
 COLUMNS = (
@@ -69,7 +72,29 @@ def main() -> None:
     parser.add_argument(
         "--only", nargs="*", choices=EXAMPLES, default=list(EXAMPLES), help="environments"
     )
+    parser.add_argument(
+        "--only-page", action="store_true", help="write the page from worked_examples.csv"
+    )
     options = parser.parse_args()
+    published = options.out / "worked_examples.csv"
+    if options.only_page:
+        with published.open(newline="") as file:
+            rows: list[dict[str, Any]] = list(csv.DictReader(file))
+    else:
+        rows = _computed(options)
+        with atomic_write(published) as temporary, temporary.open("w", newline="") as file:
+            table = csv.DictWriter(file, COLUMNS)
+            table.writeheader()
+            table.writerows(rows)
+    page = published.with_suffix(".md")
+    if page.is_file():
+        above = page.read_text().partition(WRITTEN)[0]
+        page.write_text(f"{above}{WRITTEN}\n\n{_limits(rows)}\n{_table(rows)}\n")
+    print(_table(rows))
+
+
+def _computed(options: Any) -> list[dict[str, Any]]:
+    """Run the environments, and return the rows of all finished ones."""
     for name in options.only:
         _example(name, options)
     rows = [
@@ -78,15 +103,36 @@ def main() -> None:
         for row in json.loads(path.read_text())
     ]
     order = list(EXAMPLES)
-    rows.sort(key=lambda row: order.index(row["environment"]))
-    with (
-        atomic_write(options.out / "worked_examples.csv") as temporary,
-        temporary.open("w", newline="") as file,
-    ):
-        table = csv.DictWriter(file, COLUMNS)
-        table.writeheader()
-        table.writerows(rows)
-    print(_table(rows))
+    return sorted(rows, key=lambda row: order.index(row["environment"]))
+
+
+def _limits(rows: list[dict[str, Any]]) -> str:
+    """Return the section on what the results do not show, with returns on ideal forces."""
+    seeds = len({row["seed"] for row in rows})
+    lines = []
+    for name in dict.fromkeys(row["environment"] for row in rows):
+        returns = {
+            through: [
+                float(row["return"])
+                for row in rows
+                if (row["environment"], row["trained through"], row["tested on"])
+                == (name, through, "ideal")
+            ]
+            for through in THROUGH[:2]
+        }
+        chosen = ", ".join(f"{value:.4g}" for value in returns["chosen"])
+        lines.append(f"  - {name}: {chosen}; ideal-trained {np.mean(returns['ideal']):.4g} (mean).")
+    return f"""## Limits
+
+- There are only {seeds} seeds of each kind. The brackets are the lowest and the highest return of
+  {seeds} policies, and not confidence intervals.
+- A policy that was trained through a motor may be worse without it. The {seeds} policies that were
+  trained through the chosen motors return on ideal forces:
+{chr(10).join(lines)}
+- Everything is simulated, with one agent (SAC) and perfect observations.
+
+Mean return by training and test:
+"""
 
 
 def _example(name: str, options: Any) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -11,6 +12,8 @@ import imageio
 import pytest
 
 import benchmark
+import benchmark_training
+import worked_examples
 from codrl_mj.actuators import IDEAL
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.runs.summaries import read_run
@@ -92,6 +95,26 @@ def test_the_worked_examples(tmp_path):
     }
     again = run("worked_examples.py", *options)  # nothing is left to do
     assert again.splitlines()[-1] == printed.splitlines()[-1]
+
+
+def test_the_page_of_the_worked_examples_follows_from_their_rows(tmp_path):
+    for name in ("worked_examples.csv", "worked_examples.md"):
+        shutil.copy(SCRIPTS.parent / "docs" / name, tmp_path)
+    page = tmp_path / "worked_examples.md"
+    published = page.read_text()
+    page.write_text(published.partition(worked_examples.WRITTEN)[0])
+    run("worked_examples.py", "--only-page", "--out", tmp_path)
+    assert page.read_text() == published
+    text = " ".join(published.split())
+    assert "double pendulum: 6733, 681.5, 6684; ideal-trained 8775 (mean)" in text
+    assert "two of these policies return 6733 and 6684, where ideal-trained ones" in text
+
+
+def test_the_page_of_training_speed_follows_from_its_rows():
+    written = f"{benchmark_training.table()}\n{benchmark_training.limits()}"
+    page = benchmark_training.PAGE.read_text()
+    assert page.partition(benchmark_training.WRITTEN)[2] == f"\n\n{written}"
+    assert "EnvPool's task on Pendulum (9 of 10)" in written
 
 
 def test_from_a_bench_log_to_a_policy(tmp_path):

@@ -88,8 +88,8 @@ def judge_by_task(
     for (number, task), verdict in zip(contrasts_of, judged, strict=True):
         other_strata = [
             stratum
-            for (other, other_task), stratum in strata.items()
-            if other == number and other_task != task and stratum is not None
+            for (pooled_number, tested_task), stratum in strata.items()
+            if pooled_number == number and tested_task != task and stratum is not None
         ]
         others = effect(other_strata) if other_strata and (number, task) in strata else None
         is_needed = others is not None and not _supports(others, pooled[number])
