@@ -354,8 +354,9 @@ on ideal forces and at other severities, {num_again} of them were trained again,
 differs between machines, so these are other policies, although their runs have the same names, which follow from the
 settings. {RUNS} marks their {len(again)} rows in the column `trained_again`. The unmarked rows of these runs, at the trained
 severity, are those of the first study. The scores of the retrained policies at the trained severity were not kept, so
-that it cannot be checked if the two sets agree there. Any comparison of a policy's score at the trained severity with its
-score elsewhere compares two policies."""
+that it cannot be checked if the two sets agree there. The returns in {LEARNING} are those of the
+retrained policies. Any comparison of a policy's score at the trained severity with its score elsewhere compares two
+policies."""
     return (
         "## How it was measured\n\n"
         + "\n\n".join(

@@ -299,6 +299,18 @@ def test_the_overview_counts_trainings_and_hours_as_the_tables_do():
     )
 
 
+def test_the_published_page_follows_from_the_published_rows(tmp_path):
+    """Compare the page and its tables byte for byte, without run folders."""
+    (tmp_path / "insurance").mkdir()
+    for name in ("runs.csv", "learning.csv", "totals.json"):
+        shutil.copy(RESULTS / "insurance" / name, tmp_path / "insurance")
+    shutil.copy(RESULTS / "insurance_conclusions.md", tmp_path)
+    files, failures = InsuranceStudy(root=tmp_path / "none", out=tmp_path).write()
+    assert not failures
+    for file in files:
+        assert file.read_bytes() == (RESULTS / file.relative_to(tmp_path)).read_bytes(), file.name
+
+
 def test_questions_with_fewer_policies_than_planned_are_not_judged(written, tmp_path):
     out, _ = written
     (tmp_path / "insurance").mkdir()
