@@ -89,7 +89,7 @@ def main() -> None:
     page = published.with_suffix(".md")
     if page.is_file():
         above = page.read_text().partition(WRITTEN)[0]
-        page.write_text(f"{above}{WRITTEN}\n\n{_limits(rows)}\n{_table(rows)}\n")
+        page.write_text(f"{above}{WRITTEN}\n\n{_table(rows)}\n")
     print(_table(rows))
 
 
@@ -104,35 +104,6 @@ def _computed(options: Any) -> list[dict[str, Any]]:
     ]
     order = list(EXAMPLES)
     return sorted(rows, key=lambda row: order.index(row["environment"]))
-
-
-def _limits(rows: list[dict[str, Any]]) -> str:
-    """Return the section on what the results do not show, with returns on ideal forces."""
-    seeds = len({row["seed"] for row in rows})
-    lines = []
-    for name in dict.fromkeys(row["environment"] for row in rows):
-        returns = {
-            through: [
-                float(row["return"])
-                for row in rows
-                if (row["environment"], row["trained through"], row["tested on"])
-                == (name, through, "ideal")
-            ]
-            for through in THROUGH[:2]
-        }
-        chosen = ", ".join(f"{value:.4g}" for value in returns["chosen"])
-        lines.append(f"  - {name}: {chosen}; ideal-trained {np.mean(returns['ideal']):.4g} (mean).")
-    return f"""## Limits
-
-- There are only {seeds} seeds of each kind. The brackets are the lowest and the highest return of
-  {seeds} policies, and not confidence intervals.
-- A policy that was trained through a motor may be worse without it. The {seeds} policies that were
-  trained through the chosen motors return on ideal forces:
-{chr(10).join(lines)}
-- Everything is simulated, with one agent (SAC) and perfect observations.
-
-Mean return by training and test:
-"""
 
 
 def _example(name: str, options: Any) -> None:
