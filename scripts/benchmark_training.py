@@ -37,8 +37,6 @@ LIMITS = """## Limits
 - We made the settings `fast` for this stopwatch and these two tasks. The other libraries run the
   settings that their authors recommend, which are not tuned for these thresholds. Compare them with
   `default`, although we chose `default` on these tasks, too.
-- CartPole and Pendulum are small. These times say nothing about larger tasks, or about the quality
-  of a policy beyond the threshold.
 """
 """Section below the table."""
 COLUMNS = (

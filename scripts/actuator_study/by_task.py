@@ -61,11 +61,6 @@ def judge_by_task(
     """Judge pooled questions on each of their tasks, and pooled over all other tasks.
 
     No plan has these comparisons. They are corrected together, by Benjamini and Hochberg.
-
-    Args:
-        scores: scores of the study.
-        pooled: verdicts on the pooled questions.
-        min_policies: smallest number of policies in each group to judge a question.
     """
     contrasts_of: dict[tuple[int, str], list[Contrast]] = {}
     for number, verdict in enumerate(pooled):
@@ -76,16 +71,14 @@ def judge_by_task(
         for key, contrasts in contrasts_of.items()
         if (tested := [contrast for contrast in contrasts if scores.stratum([contrast])])
     }
-    judged = judge(
-        scores,
-        [
-            dataclasses.replace(pooled[number].question, contrasts=tuple(contrasts))
-            for (number, _), contrasts in contrasts_of.items()
-        ],
-        min_policies=min_policies,
-    )
+    single = [
+        dataclasses.replace(pooled[number].question, contrasts=tuple(contrasts))
+        for (number, _), contrasts in contrasts_of.items()
+    ]
     results = []
-    for (number, task), verdict in zip(contrasts_of, judged, strict=True):
+    for (number, task), verdict in zip(
+        contrasts_of, judge(scores, single, min_policies=min_policies), strict=True
+    ):
         other_strata = [
             stratum
             for (pooled_number, tested_task), stratum in strata.items()
@@ -108,12 +101,10 @@ def _supports(interval: Interval, verdict: Verdict) -> bool:
 
 def rests_text(name: str, verdicts: Iterable[TaskVerdict]) -> str:
     """Return the tasks on which a question's verdict rests, with the effect without each."""
-    return (
-        "; ".join(
-            f"{TITLES[verdict.task]}: {mean:+z.3f} [{low:+z.3f}, {high:+z.3f}]"
-            for verdict in verdicts
-            if verdict.is_needed and verdict.question.name == name and verdict.others is not None
-            for mean, low, high in [verdict.others]
-        )
-        or "–"
-    )
+    texts = [
+        f"{TITLES[verdict.task]}: {mean:+z.3f} [{low:+z.3f}, {high:+z.3f}]"
+        for verdict in verdicts
+        if verdict.is_needed and verdict.question.name == name and verdict.others is not None
+        for mean, low, high in [verdict.others]
+    ]
+    return "; ".join(texts) or "–"

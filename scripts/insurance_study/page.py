@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from actuator_study import questions as actuator_questions
 from actuator_study.arms import DRAWN
 from actuator_study.by_task import BY_TASK, RESTS, TaskVerdict, judge_by_task, rests_text
 from actuator_study.figures import dots
@@ -45,7 +46,6 @@ from insurance_study.questions import (
     primary,
     reach,
     secondary,
-    trained_again,
     trial_at,
     trials,
 )
@@ -322,8 +322,10 @@ def _secondary(verdicts: Sequence[Verdict]) -> str:
 
 
 def _run_rows(collected: StudyResults, scores: Scores) -> list[dict[str, object]]:
-    """Return a row for every policy and test; `trained_again` marks policies as explained there."""
-    again = {trial.name for trial in trials() if trained_again(trial)}
+    """Return a row for every policy and test, with a mark for retrained policies."""
+    # Rows of trials that the first study has are its own.
+    first = {trial.name for trial in actuator_questions.trials()}
+    again = {trial.name for trial in trials() if not needs_new_policies(trial)} - first
     return [
         row | {"trained_again": f"{row['task']}: {row['trained']} on {row['tested']}" in again}
         for row in run_rows(collected, scores.by_seed)
@@ -349,19 +351,12 @@ these {num_new + num_again} trainings is known: {totals.seconds / 3600:.1f} hour
 [hypotheses by task]({FOLDER}/{BY_TASK}), and [mean returns in each tenth of a training]({FOLDER}/{LEARNING}). Of
 {count} kinds of training {len(rising)} had not leveled off ({"; ".join(rising) or "none"}). Their mean return in the last
 tenth is more than {MARGIN:g} of the span above that in the eighth."""
-    repeated = f"""**Policies that were trained again.** The run folders of the first study are gone. To test its policies
-on ideal forces and at other severities, {num_again} of them were trained again, with the same settings and seeds. Rounding
-differs between machines, so these are other policies, although their runs have the same names, which follow from the
-settings. {RUNS} marks their {len(again)} rows in the column `trained_again`. The unmarked rows of these runs, at the trained
-severity, are those of the first study. The scores of the retrained policies at the trained severity were not kept, so
-that it cannot be checked if the two sets agree there. The returns in {LEARNING} are those of the
-retrained policies. Any comparison of a policy's score at the trained severity with its score elsewhere compares two
-policies."""
-    return (
-        "## How it was measured\n\n"
-        + "\n\n".join(
-            textwrap.fill(" ".join(part.split()), 120, break_long_words=False)
-            for part in ([text, repeated] if again else [text])
-        )
-        + "\n"
+    repeated = f"""{RUNS} marks the {len(again)} rows of the {num_again} retrained policies in the column `trained_again`.
+Their runs have the same names as those of the first study, but they are [other policies](insurance_plan.md#changes): a
+comparison of a score at the trained severity with one elsewhere compares two policies. Their own scores at the trained
+severity were not kept, so that it cannot be checked if the two sets agree there."""
+    paragraphs = (
+        textwrap.fill(" ".join(part.split()), 120, break_long_words=False)
+        for part in (text, repeated)
     )
+    return "\n\n".join(["## How it was measured", *paragraphs]) + "\n"

@@ -4,7 +4,6 @@ import functools
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from actuator_study import questions as actuator_questions
 from actuator_study.arms import DRAWN
 from actuator_study.arms import drawn as drawn_severities
 from codrl_mj.disturbances import Disturbances
@@ -328,16 +327,3 @@ def needs_new_policies(trial: Trial) -> bool:
     known = {"ideal", *AXES, *(f"{axis}, drawn" for axis in DRAWN)}
     kind = trial.arm.name.partition(": ")[2]
     return kind != "ideal" and (trial.arm.task == "acrobot" or kind not in known)
-
-
-def trained_again(trial: Trial) -> bool:
-    """Return True if policies of the first study's arms were trained again for the trial.
-
-    Rows of trials that the first study has are its own.
-    """
-    return not needs_new_policies(trial) and trial.name not in _first_study()
-
-
-@functools.cache
-def _first_study() -> frozenset[str]:
-    return frozenset(trial.name for trial in actuator_questions.trials())
