@@ -3,7 +3,10 @@
 A reported number is usually from one run or one episode. The measured values are a sample over
 seeds. One rule judges bounds and comparisons: the 95 % interval lies inside (*confirmed*), outside
 (*not confirmed*), or across (*open*). If a statement is about a single run or episode that could be
-one of ours, it is only *compatible*.
+one of ours, it is only *compatible*, unless the interval of our mean lies in a range that the
+statement leaves.
+
+Ranges include their ends: a value that equals an end lies inside. "Under 85 s" excludes 85 s.
 """
 
 import dataclasses
@@ -31,7 +34,7 @@ class Verdict(NamedTuple):
     measured: Interval | None = None
     """Measured value, with its 95 % interval over seeds; None if there is none."""
     samples: int = 0
-    """Number of seeds of the arm that has the fewest."""
+    """Number of trainings of the arm that has the fewest; a seed may have two."""
     p: float | None = None
     """p-value of no difference between two arms: two-sided t test, not corrected."""
 
@@ -41,11 +44,11 @@ class Check:
     """Rule that judges one value for each seed of every arm; an array if times are judged."""
 
     rule: str
-    """`mean`, `difference`, `paired`, `one run`, `one episode` or `every seed`."""
+    """Name of the rule, such as `mean`; examples/recompute_reproduction.py has all of them."""
     low: float
-    """Lower bound, or the number that is reported for one run or episode."""
+    """Lower bound of what is stated; equal to `high` if that is a number."""
     high: float
-    """Upper bound, or the same number."""
+    """Upper bound; only *under* excludes the bound itself."""
     criterion: str
     """Condition in words."""
     judge: Callable[..., Verdict]
@@ -136,44 +139,86 @@ def _difference(low: float, high: float, criterion: str, paired: bool) -> Check:
     return Check("paired" if paired else "difference", low, high, criterion, judge)
 
 
-def one_run(figure: float) -> Check:
-    """Return the check that a number from one run is within the prediction interval of ours."""
+def judge_single(measured: Interval, single: tuple[float, float], low: float, high: float) -> str:
+    """Judge a range that is stated for one run or episode; if low is high, it is a number.
+
+    The interval of our mean can only confirm a range. `single` is the range of 95 % of our single
+    runs or episodes.
+    """
+    if low < high and judge_interval(measured, low, high)[0] == CONFIRMED:
+        return CONFIRMED
+    return COMPATIBLE if single[0] <= high and low <= single[1] else NOT_CONFIRMED
+
+
+def _stated(low: float, high: float) -> str:
+    return number(low) if low == high else f"a value from {number(low)} to {number(high)}"
+
+
+def one_run(figure: float, tolerance: float = 0.0) -> Check:
+    """Return the check that a number from one run is within the prediction interval of ours.
+
+    The tolerance is the reach of "about" on both sides.
+    """
+    low, high = figure - tolerance, figure + tolerance
 
     def judge(values: np.ndarray) -> Verdict:
-        low, high = prediction_interval(values)
-        reason = (
-            f"95 % of single runs lie from {number(low)} to {number(high)} (Student's prediction"
-            " interval)"
-        )
-        return Verdict(
-            COMPATIBLE if low <= figure <= high else NOT_CONFIRMED, reason, mean_interval(values)
-        )
+        single, measured = prediction_interval(values), mean_interval(values)
+        reason = "95 % of single runs lie from {} to {} (Student's prediction interval)"
+        outcome = judge_single(measured, single, low, high)
+        return Verdict(outcome, reason.format(*map(number, single)), measured)
 
-    criterion = f"{number(figure)} is within the range of 95 % of single runs"
-    return Check("one run", figure, figure, criterion, judge)
+    criterion = f"{_stated(low, high)} is within the range of 95 % of single runs"
+    return Check("one run", low, high, criterion, judge)
 
 
-def one_episode(figure: float) -> Check:
+def one_episode(figure: float, tolerance: float = 0.0, under: bool = False) -> Check:
     """Return the check that a time [s] from one episode is within the range of our episodes'.
 
     It judges an array for each seed: times of test episodes [s], infinite if the goal was not
-    reached. The measured value is the mean over seeds of the median over episodes that arrive.
+    reached. The measured value is the mean over seeds of the median over episodes that arrive. The
+    tolerance is the reach of "about" on both sides; `under` excludes the figure and later times.
     """
+    low, high = -math.inf if under else figure - tolerance, figure + tolerance
 
     def judge(times: list[np.ndarray]) -> Verdict:
         all_times = np.concatenate(times)
         arrived = all_times[np.isfinite(all_times)]
         if not len(arrived):
             return Verdict(NOT_CONFIRMED, f"none of {len(all_times)} episodes arrives")
-        low, high = central_range(arrived)
-        reason = f"95 % of those that arrive take {number(low)} to {number(high)} s"
+        single, measured = central_range(arrived), mean_interval(medians(times))
+        reason = "95 % of those that arrive take {} to {} s".format(*map(number, single))
+        if under:
+            share = 100 * float(np.mean(arrived < figure))
+            reason += f"; {number(share)} % take less than {number(figure)} s"
         if len(arrived) < len(all_times):
             reason += f"; {len(all_times) - len(arrived)} of {len(all_times)} never arrive"
-        outcome = COMPATIBLE if low <= figure <= high else NOT_CONFIRMED
-        return Verdict(outcome, reason, mean_interval(medians(times)))
+        # A time that equals the figure is not under it.
+        highest = math.nextafter(high, low) if under else high
+        return Verdict(judge_single(measured, single, low, highest), reason, measured)
 
-    criterion = f"{number(figure)} s is within the range of 95 % of the test episodes that arrive"
-    return Check("one episode", figure, figure, criterion, judge, min_seeds=1)
+    time = f"a time under {number(figure)}" if under else _stated(low, high)
+    criterion = f"{time} s is within the range of 95 % of the test episodes that arrive"
+    return Check("under" if under else "one episode", low, high, criterion, judge, min_seeds=1)
+
+
+def behavior(usual: float) -> Check:
+    """Return the check of a behavior that one episode shows, by the share of our episodes.
+
+    It is confirmed if the whole interval of the share is at least `usual`, and compatible if the
+    share is at least 1 - `usual`, so that the paper's episode is no accident.
+    """
+
+    def judge(shares: np.ndarray) -> Verdict:
+        measured = mean_interval(shares)
+        compatible = COMPATIBLE if measured.mean + usual >= 1.0 else NOT_CONFIRMED
+        outcome = CONFIRMED if measured.low >= usual else compatible
+        return Verdict(outcome, f"{number(100 * measured.mean)} % of ours show it", measured)
+
+    criterion = (
+        f"the 95 % interval of the share is at least {number(usual)} (*compatible*: its mean"
+    )
+    criterion += f" is at least {number(1.0 - usual)})"
+    return Check("behavior", usual, math.inf, criterion, judge)
 
 
 def every_seed(limit: float) -> Check:

@@ -13,6 +13,7 @@ import numpy as np
 from reproduction.checks import (
     Check,
     Verdict,
+    behavior,
     every_seed,
     higher,
     number,
@@ -33,7 +34,9 @@ ALMOST_PERFECT = 5.0
 WELL = 20.0
 # Differences of returns that do not matter.
 SIMILAR_RETURN = {"pendulum": 10.0, "mountain_car": 3.0, "cartpole": 200.0}
-# Share of the test episodes above which the paper's single episode is no accident.
+# Reach of "about", "approximately" and "~" on both sides, of returns and of times [s].
+ABOUT = 5.0
+# Share of the test episodes from which on a behavior is the usual one.
 ALWAYS = 0.95
 # Share of the steps of a test episode.
 NEAR_CENTRE = 0.9
@@ -118,7 +121,7 @@ class Claim:
         column = {TIMES: "time_to_goal"}.get(self.measure, self.measure.column)
         ideal = rows.get(f"{self.task}, {self.settings}, ideal, mujoco", ())
         values = [float(row[column]) for row in ideal if row[column]]
-        if not values or len(self.arms) > 1 or self.measure in (TRACKING, LARGEST_ERROR):
+        if not values or len(self.arms) > 1 or column.startswith("tracking"):
             return None
         return float(np.mean(values))
 
@@ -129,6 +132,8 @@ UPRIGHT = Measure("share of test episodes that end upright", "upright", "share")
 SUCCESS = Measure("share of test episodes that succeed", "success", "share")
 TIMES = Measure("time to the goal in test [s]", "times", "s", times_of)
 TRACKING = Measure("rms torque error / rms desired torque [%]", "tracking_percent", "%")
+STEP_TRACKING = Measure(TRACKING.text + " at policy steps", "tracking_step_percent", "%")
+"""Torque error of tasks with an inner loop: the paper's Algorithm 2 reports its last torque."""
 LARGEST_ERROR = Measure("largest torque error in test [N·m]", "tracking_max", "N·m")
 CENTRED = Measure("share of the 500 steps with |x| <= 0.1 m", "centred", "share")
 LONG_EPOCH = Measure("first epoch of length 4000", "long_epoch")
@@ -192,11 +197,12 @@ def _beats(measure: Measure) -> list[_Row]:
 
 
 _PERFECT, _TRACKED = within(high=ALMOST_PERFECT), "torque error"
+_LAST = "return of the last 50 episodes"
 CLAIMS: tuple[Claim, ...] = (
     *_paper(
         "pendulum",
         ("5b", _TRACKED, "almost none", TRACKING, _MOTOR, _PERFECT),
-        ("5c–f", "upright within 10 s", "yes", UPRIGHT, _MOTOR, within(low=ALWAYS)),
+        ("5c–f", "upright within 10 s", "yes", UPRIGHT, _MOTOR, behavior(ALWAYS)),
         settings=_BOTH,
     ),
     *_paper(
@@ -213,10 +219,10 @@ CLAIMS: tuple[Claim, ...] = (
     ),
     *_paper(
         "mountain_car",
-        ("6a", "return of the last 50 episodes", "-114", LAST, _MOTOR, one_run(-114.0)),
-        ("6b", _TRACKED, "imperfect", TRACKING, _MOTOR, within(low=ALMOST_PERFECT)),
-        ("", f"{_TRACKED}, gains 2, 10, 1e-6", "perfect", TRACKING, _FAST, _PERFECT),
-        ("6c", "time to the goal", "85 s", TIMES, _MOTOR, one_episode(85.0)),
+        ("6a", _LAST, "about -114", LAST, _MOTOR, one_run(-114.0, ABOUT)),
+        ("6b", _TRACKED, "imperfect", STEP_TRACKING, _MOTOR, within(low=ALMOST_PERFECT)),
+        ("", f"{_TRACKED}, gains 2, 10, 1e-6", "perfect", STEP_TRACKING, _FAST, _PERFECT),
+        ("6c", "time to the goal", "under 85 s", TIMES, _MOTOR, one_episode(85.0, under=True)),
         ("", "time to the goal, gains 2, 10, 1e-6", "100 s", TIMES, _FAST, one_episode(100.0)),
         ("", "time to the goal, no motor", "160 s", TIMES, _IDEAL, one_episode(160.0)),
         *_beats(RETURN),
@@ -225,23 +231,23 @@ CLAIMS: tuple[Claim, ...] = (
     *_same_physics("mountain_car", ("paper gains", "fast gains", "ideal")),
     *_paper(
         VALUE_TASK,
-        ("7a", "return of the last 50 episodes", "95", LAST, _MOTOR, within(90.0, 100.0)),
+        ("7a", _LAST, "about 95", LAST, _MOTOR, one_run(95.0, ABOUT)),
         ("7c", "time to the goal", "75 s", TIMES, _MOTOR, one_episode(75.0)),
-        ("7b", _TRACKED, "almost none", TRACKING, _MOTOR, _PERFECT),
+        ("7b", _TRACKED, "almost none", STEP_TRACKING, _MOTOR, _PERFECT),
         settings=_BOTH,
     ),
     *_paper(
         "acrobot",
-        ("8b", _TRACKED, "small", TRACKING, _MOTOR, within(high=WELL)),
-        ("8a", "return of the last 50 episodes", "-200", LAST, _MOTOR, one_run(-200.0)),
-        ("8c", "time to the goal", "25 s", TIMES, _MOTOR, one_episode(25.0)),
+        ("8b", _TRACKED, "small", STEP_TRACKING, _MOTOR, within(high=WELL)),
+        ("8a", _LAST, "about -200", LAST, _MOTOR, one_run(-200.0, ABOUT)),
+        ("8c", "time to the goal", "about 25 s", TIMES, _MOTOR, one_episode(25.0, ABOUT)),
     ),
     *_paper(
         "cartpole",
         ("9a", "first whole epoch", "epoch 32", LONG_EPOCH, _MOTOR, one_run(32)),
         ("9a", "first epoch with a return near 4000", "epoch 35", PAID_EPOCH, _MOTOR, one_run(35)),
         ("9b", "largest torque error", "0.1 N·m", LARGEST_ERROR, _MOTOR, every_seed(0.1)),
-        ("9c–d", "in bounds", "yes", SUCCESS, _MOTOR, within(low=ALWAYS)),
+        ("9c–d", "in bounds", "yes", SUCCESS, _MOTOR, behavior(ALWAYS)),
         ("9d", "near the origin", "yes", CENTRED, _MOTOR, within(low=NEAR_CENTRE)),
     ),
     *_same_physics("cartpole", ("paper gains", "ideal")),

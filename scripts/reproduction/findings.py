@@ -170,7 +170,7 @@ def _claim_row(claim: Claim, verdict: Verdict, corrected: float | None) -> dict[
         "mean": mean,
         "low": low,
         "high": high,
-        "seeds": verdict.samples,
+        "trainings": verdict.samples,
         "p": verdict.p,
         "p_corrected": corrected,
         "verdict": verdict.outcome,

@@ -8,7 +8,7 @@ from codrl_mj.study.pages import TITLES, markdown_table, read_conclusions, write
 from codrl_mj.study.trials import format_ranges
 from reproduction import figures
 from reproduction.checks import NOT_TESTABLE, OUTCOMES, Verdict, medians, number
-from reproduction.claims import PAPER_SAYS, TIMES, UPRIGHT, Claim, as_text
+from reproduction.claims import PAPER_SAYS, STEP_TRACKING, TIMES, TRACKING, UPRIGHT, Claim, as_text
 from reproduction.drawn import CURVES, STATES, TORQUES, Table
 from reproduction.findings import CLAIM_ROWS, EVERYTHING, Findings, write_files
 from reproduction.rows import RUNS, times_of
@@ -98,6 +98,11 @@ def _ours(findings: Findings, claim: Claim, verdict: Verdict) -> str:
     """Format the measured value of a claim, with its interval; for times the median."""
     if claim.measure is UPRIGHT and verdict.measured:
         return f"{as_text(UPRIGHT, verdict.measured.mean)}{_after(findings, claim.arms[0])}"
+    if claim.measure is STEP_TRACKING:
+        step = as_text(STEP_TRACKING, verdict.measured.mean) if verdict.measured else "–"
+        runs = findings.runs[claim.arms[0]]
+        every_step = TRACKING.values([row for row in runs if row[STEP_TRACKING.column]] or runs)
+        return f"{step} ({as_text(TRACKING, every_step.mean())})" if len(every_step) else "–"
     if verdict.measured is None:
         return "never" if claim.measure is TIMES and verdict.outcome != NOT_TESTABLE else "–"
     mean, low, high = verdict.measured
@@ -135,7 +140,8 @@ def verdicts_line(verdicts: Judged) -> str:
     return f"""\
 **Of {counts.total()} statements: {outcomes}.** The 95 % interval [in brackets] is inside the stated
 range (*confirmed*), outside (*not confirmed*), or across its edge (*open*). *Compatible* means that the paper's single
-run or episode could be one of ours. This is easier to reach if ours scatter more.
+run or episode could be one of ours. This is easier to reach if ours scatter more. Torque errors are those at the agent's steps, as the
+paper reports them. Those over all integration steps are in parentheses.
 """
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from codrl_mj.actuators import IDEAL
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import holds_since
 from codrl_mj.runs import EPISODES
@@ -39,11 +40,12 @@ TESTED = (
     *("saturated_percent", "peak_voltage"),
 )
 """Measures of the test, as in docs/evaluation.md: means, and the median time to the goal."""
-FURTHER = ("centred", "long_epoch", "paid_epoch", "upright", "times")
+FURTHER = ("centred", "long_epoch", "paid_epoch", "upright", "times", "tracking_step_percent")
 """Measures of single tasks.
 
 They are the share of steps near the center, first epochs, the share of episodes that end upright,
-and the times of all test episodes to the goal, or upright [s], with `-` if it was not reached.
+the times of all test episodes to the goal, or upright [s], with `-` if it was not reached, and with
+an inner loop the torque error at the end of the policy's steps [%].
 """
 COLUMNS = (
     *("task", "settings", "motor", "gains", "physics", "seed", "run", "seconds", f"last_{LAST}"),
@@ -108,18 +110,18 @@ def complete(rows: Iterable[Row], columns: set[str]) -> bool:
 
 
 def joined(rows: Sequence[Row], new: Row) -> list[Row]:
-    """Add a row to those of its seed, in place of a row of the same training.
+    """Add a row to those of its seed, in place of one with the same results.
 
-    Trainings with other versions of packages have other results, and are kept.
+    Trainings with other versions of packages have other results, and are kept. The name of the new
+    run gets the suffix ` again` if such a training has the same configuration, and thus its name.
     """
 
     def training(row: Row) -> list[str]:
         return [row[name] for name in (f"last_{LAST}", *TESTED)]
 
-    other_rows = [
-        row for row in rows if row["run"] != new["run"] and training(row) != training(new)
-    ]
-    return [*other_rows, new]
+    other_rows = [row for row in rows if training(row) != training(new)]
+    is_name_taken = any(row["run"] == new["run"] for row in other_rows)
+    return [*other_rows, {**new, "run": f"{new['run']} again"} if is_name_taken else new]
 
 
 def times_of(text: str) -> np.ndarray:
@@ -166,6 +168,9 @@ def run_row(arm: PaperArm, seed: int, run: Trained) -> Row:
         if arm.task == "pendulum":
             times = [upright_since(episode) for episode in run_tests(arm, run.folder, len(times))]
             row["upright"] = float(np.mean([time is not None for time in times]))
+        elif arm.actuator != IDEAL:
+            episodes = run_tests(arm, run.folder, len(times))
+            row["tracking_step_percent"] = step_tracking(episodes)
         row["times"] = " ".join("-" if time is None else f"{time:.6g}" for time in times)
     return {name: "" if row[name] is None else str(row[name]) for name in COLUMNS}
 
@@ -173,6 +178,20 @@ def run_row(arm: PaperArm, seed: int, run: Trained) -> Row:
 def run_tests(arm: PaperArm, folder: Path, episodes: int) -> list[Episode]:
     """Run the first test episodes of a run's policy."""
     return run_episodes(load_policy(folder), arm.trials[TEST].env.build, episodes, EVALUATION_SEED)
+
+
+def step_tracking(episodes: Sequence[Episode]) -> float | None:
+    """Return the rms torque error by the rms desired torque at the end of the policy's steps [%].
+
+    With an inner loop this is its last step, as in the paper's Algorithm 2; `tracking_percent` is
+    that of all its steps. It is None if no torque is desired.
+    """
+    desired, actual = (
+        np.concatenate([episode.signals[name] for episode in episodes])
+        for name in ("desired_force", "actual_force")
+    )
+    error, scale = float(np.mean((actual - desired) ** 2)), float(np.mean(desired**2))
+    return 100.0 * (error / scale) ** 0.5 if scale > 0 else None
 
 
 def upright_since(episode: Episode) -> float | None:

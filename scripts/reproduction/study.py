@@ -120,7 +120,7 @@ class Reproduction(Program):
         findings = self.findings()
         files = write(findings, self.out)
         table = Table(
-            "task", "said by", "what is reported", "ours [95 %]", "seeds", "verdict", box=None
+            "task", "said by", "what is reported", "ours [95 %]", "trainings", "verdict", box=None
         )
         for claim, verdict in findings.verdicts:
             ours = (

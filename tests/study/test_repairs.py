@@ -4,6 +4,7 @@ import dataclasses
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import study_repairs
@@ -20,8 +21,8 @@ from study_repairs import (
     OPEN,
     PAGE,
     REPAIRS,
+    Judged,
     RepairsStudy,
-    judge,
     judge_rows,
     reference,
     without,
@@ -87,7 +88,8 @@ def test_made_up_repairs_get_their_verdicts(study):
     study.write()
     page = (study.out / PAGE).read_text()
     assert re.search(
-        r"\| discount \| 1\.0 \| 1\.0 \| 0 of 5 \| -92\.0 \[-\S+, -\S+\] \| \*\*needed", page
+        r"\| all without discount \| 1\.0 \| 1\.0 \| 0 of 5 \| -92\.0 \[-\S+, -\S+\] \| \*\*needed",
+        page,
     )
     assert "5 seeds of every arm are judged" in page
     assert len(read_csv(study.out / FOLDER / RUNS)) == 5 * len(REPAIRS)
@@ -103,17 +105,18 @@ def test_made_up_repairs_get_their_verdicts(study):
     ],
 )
 def test_an_interval_beyond_the_margin_decides(low, high, outcome):
-    assert judge(Interval((low + high) / 2, low, high)) == outcome
+    difference = Interval((low + high) / 2, low, high)
+    assert Judged("noise", np.zeros((5, 3)), difference).outcome == outcome
 
 
 def test_only_seeds_of_all_arms_are_judged_and_two_are_needed(study):
     rows = study.rows()
     rows["noise"] = {seed: row for seed, row in rows["noise"].items() if seed < 2}
-    assert {len(item.returns) for item in judge_rows(rows)} == {2}
+    assert {len(item.values) for item in judge_rows(rows)} == {2}
     del rows["noise"][1]
     assert {item.outcome for item in judge_rows(rows)} == {NOT_JUDGED}
     rows["noise"] = {}
-    assert {len(item.returns) for item in judge_rows(rows)} == {0}
+    assert {len(item.values) for item in judge_rows(rows)} == {0}
 
 
 def test_published_rows_are_not_trained_again(study):
@@ -128,7 +131,7 @@ def test_published_rows_are_not_trained_again(study):
 def test_the_study_is_that_of_the_plan():
     plan, study = " ".join(PLAN.read_text().split()), RepairsStudy()
     assert f"need {len(study.every.cells)} new trainings" in plan
-    assert f"in {study.test_episodes} episodes" in plan
+    assert f"in {study.every.episodes} episodes" in plan
     assert f"at a level of {100 * study_repairs.CONFIDENCE:g} %" in plan
     assert f"The margin is {study_repairs.MARGIN:g}" in plan
     assert f"{reference('paper').config.total_episodes} episodes" in plan

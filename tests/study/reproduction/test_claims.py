@@ -9,7 +9,7 @@ import pytest
 
 from codrl_mj.actuators import IDEAL, CurrentLoop, Motor
 from codrl_mj.study.trials import format_ranges
-from codrl_mj.tasks import named_actuator
+from codrl_mj.tasks import find_task, named_actuator
 from codrl_mj.training import TrainConfig
 from reproduction.arms import ARMS, TASKS
 from reproduction.checks import COMPATIBLE, CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE, OPEN, OUTCOMES
@@ -25,6 +25,7 @@ from reproduction.rows import (
     epochs_of,
     joined,
     run_row,
+    step_tracking,
     times_of,
     upright_since,
 )
@@ -148,13 +149,10 @@ def test_true_claims_are_confirmed_or_for_single_runs_compatible():
     statements = outcomes(world(PAPERS), PAPER_SAYS)
     assert statements[NOT_CONFIRMED] == statements[NOT_TESTABLE] == statements[OPEN] == set()
     assert statements[COMPATIBLE] == {
-        ("mountain_car", "return of the last 50 episodes"),
         ("mountain_car", "time to the goal"),
         ("mountain_car", "time to the goal, gains 2, 10, 1e-6"),
         ("mountain_car", "time to the goal, no motor"),
         ("mountain_car_continuous", "time to the goal"),
-        ("acrobot", "return of the last 50 episodes"),
-        ("acrobot", "time to the goal"),
         ("cartpole", "first whole epoch"),
         ("cartpole", "first epoch with a return near 4000"),
     }
@@ -210,12 +208,54 @@ def test_the_last_episodes_are_counted_from_the_end():
     assert times_of(row["times"]).tolist() == [1.5, np.inf]
 
 
+def test_statements_of_the_same_kind_have_the_same_check():
+    """An inner loop reports its last torque; "about" is 5 on both sides, "under" excludes ties."""
+    paper = [claim for claim in CLAIMS if claim.source == PAPER_SAYS]
+    for claim in paper:
+        if claim.statement.startswith("torque error"):
+            has_inner_loop = find_task(claim.task).motor_inner_steps > 1
+            assert claim.measure.column == (
+                "tracking_step_percent" if has_inner_loop else "tracking_percent"
+            )
+        assert claim.says.startswith("about") == (claim.check.high - claim.check.low == 10.0)
+        assert claim.says.startswith("under") == (claim.check.rule == "under")
+    assert {
+        claim.check.rule for claim in paper if claim.measure.text.startswith("share of test")
+    } == {"behavior"}
+
+
+def test_the_torque_error_of_the_last_inner_step_leaves_out_the_others():
+    """Errors of 0 and 4 with desired torques of 3 and 4: rms 4 / rms 5."""
+    episodes = [
+        types.SimpleNamespace(
+            signals={"desired_force": np.array([desired]), "actual_force": np.array([actual])},
+            trace={"actual_force": np.full(10, 99.0)},
+        )
+        for desired, actual in ((3.0, 3.0), (-4.0, 0.0))
+    ]
+    assert step_tracking(episodes) == pytest.approx(80.0)
+    assert (
+        step_tracking(
+            [
+                types.SimpleNamespace(
+                    signals=dict.fromkeys(("desired_force", "actual_force"), np.zeros(3))
+                )
+            ]
+        )
+        is None
+    )
+
+
 def test_a_row_is_replaced_by_its_training_but_not_by_one_with_other_packages():
     arm = ARM["acrobot, paper, ideal, mujoco"]
     row = made_up(arm)
     same_row, other_row = row | {"run": "renamed"}, row | {"run": "renamed", "returns": "7"}
     assert joined([row], same_row) == [same_row]
     assert joined([row], other_row) == [row, other_row]
+    named = other_row | {"run": row["run"]}
+    expected = [row, named | {"run": f"{row['run']} again"}]
+    assert joined([row], named) == expected
+    assert joined(expected, named) == expected
     assert complete([row], {"times", "returns"})
     assert not complete([row | {"times": ""}], {"times", "returns"})
 

@@ -280,6 +280,17 @@ def test_published_verdicts_follow_from_the_current_claims():
         assert (row["statement"], row["verdict"]) == (claim.statement, claim.judge(runs).outcome)
 
 
+def test_repeated_trainings_of_a_seed_change_no_verdict():
+    """docs/reproduction.md says so: 9 or 10 trainings are of 5 seeds."""
+    every, last = {arm.name: [] for arm in ARMS}, {arm.name: [] for arm in ARMS}
+    for key, arm_rows in read_rows(RESULTS / FOLDER).items():
+        every[", ".join(key[:-1])] += arm_rows
+        last[", ".join(key[:-1])].append(arm_rows[-1])
+    pairs = [(claim.judge(every), claim.judge(last)) for claim in CLAIMS]
+    assert any(both.samples > single.samples == 5 for both, single in pairs)
+    assert all(both.outcome == single.outcome for both, single in pairs)
+
+
 @pytest.mark.matrix
 def test_finished_runs_are_not_trained_again(reproduction):
     plan, _, _, _, _ = reproduction

@@ -12,6 +12,7 @@ from reproduction.checks import (
     NOT_CONFIRMED,
     NOT_TESTABLE,
     OPEN,
+    behavior,
     central_range,
     every_seed,
     higher,
@@ -100,6 +101,16 @@ def test_the_central_range_omits_a_fortieth_at_each_end():
         (one_run(5.0), [4.9, 5.0], COMPATIBLE),
         (one_run(5.0), [7.0, 7.001, 7.002], NOT_CONFIRMED),
         (one_run(5.0), [5.0], NOT_TESTABLE),
+        (one_run(5.0), [5.0, 5.0], COMPATIBLE),
+        (one_run(5.0, 1.0), [5.0, 6.0], COMPATIBLE),
+        (one_run(5.0, 1.0), [6.0, 6.0], CONFIRMED),
+        (one_run(5.0, 1.0), [7.0, 7.001, 7.002], NOT_CONFIRMED),
+        (behavior(0.95), [1.0, 1.0], CONFIRMED),
+        (behavior(0.95), [0.95, 0.95], CONFIRMED),
+        (behavior(0.95), [0.94, 1.0], COMPATIBLE),
+        (behavior(0.95), [0.0, 0.1], COMPATIBLE),
+        (behavior(0.95), [0.0, 0.09], NOT_CONFIRMED),
+        (behavior(0.95), [1.0], NOT_TESTABLE),
     ],
 )
 def test_outcomes_of_one_value_per_seed(check, values, outcome):
@@ -110,7 +121,8 @@ def test_outcomes_of_one_value_per_seed(check, values, outcome):
 
 
 @pytest.mark.parametrize(
-    "check", [within(0.0, 1.0), every_seed(1.0), one_run(1.0), one_episode(1.0)]
+    "check",
+    [within(0.0, 1.0), every_seed(1.0), one_run(1.0), one_episode(1.0), behavior(0.95)],
 )
 def test_without_runs_nothing_can_be_tested(check):
     verdict = check(NOTHING)
@@ -135,6 +147,23 @@ def test_an_episode_is_compatible_within_the_central_range():
     assert one_episode(39.0)(times).outcome == COMPATIBLE
     assert one_episode(39.5)(times).outcome == NOT_CONFIRMED
     assert one_episode(39.0)(times).measured.mean == (10.5 + 30.5) / 2
+
+
+def test_about_a_time_allows_its_tolerance_and_can_be_confirmed():
+    times = [np.arange(1.0, 21.0), np.arange(21.0, 41.0)]  # the central 95 % are 1 to 39
+    assert one_episode(44.0, 5.0)(times).outcome == COMPATIBLE
+    assert one_episode(44.5, 5.0)(times).outcome == NOT_CONFIRMED
+    assert one_episode(10.0, 5.0)([np.array([12.0]), np.array([13.0])]).outcome == COMPATIBLE
+    assert one_episode(10.0, 5.0)([np.array([12.0]), np.array([12.1])]).outcome == CONFIRMED
+
+
+def test_a_quantile_that_equals_a_bound_is_not_under_it():
+    times = [np.arange(1.0, 21.0), np.arange(21.0, 41.0)]  # the central 95 % begin at 1
+    assert one_episode(1.0)(times).outcome == COMPATIBLE
+    tie = one_episode(1.0, under=True)(times)
+    assert (tie.outcome, one_episode(1.5, under=True)(times).outcome) == (NOT_CONFIRMED, COMPATIBLE)
+    assert "0 % take less than 1 s" in tie.reason
+    assert one_episode(99.0, under=True)(times[:1] * 2).outcome == CONFIRMED
 
 
 def test_episodes_that_do_not_arrive_are_reported_without_a_time():

@@ -48,6 +48,7 @@ def made_up(
         "upright": success,
     }
     row |= {"tracking_percent": tracking, "tracking_max": largest, "centred": centre}
+    row |= {"tracking_step_percent": tracking}
     row |= {
         "time_to_goal": float(np.median(times)),
         "times": " ".join([*map(str, times[:arrived]), *"-" * (41 - arrived)]),
