@@ -15,6 +15,8 @@ _PUBLIC = {
     "c_program": "codrl_mj.arrays.c_code",
     "CProgram": "codrl_mj.arrays.c_code",
     "check_family": "codrl_mj.arrays.family",
+    "prepare_model": "codrl_mj.arrays.models",
+    "SimulatorModel": "codrl_mj.arrays.models",
     "UnsupportedError": "codrl_mj.arrays.scalars",
 }
 """Public names -> their modules, which are imported on first use."""

@@ -319,7 +319,7 @@ def build_env_config(
 
 def _patterns(items: Sequence[str]) -> dict[str, ActuatorSetting]:
     """Return pattern -> actuator from items PATTERN=NAME and from YAML files."""
-    from codrl_mj.engine.specs import resolve_patterns
+    from codrl_mj.engine.matching import resolve_patterns
 
     actuators: dict[str, ActuatorSetting] = {}
     for item in items:

@@ -1,8 +1,7 @@
 """Readout of our actuators from compiled models and their data, with either backend."""
 
 import numbers
-from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -11,13 +10,12 @@ from codrl_mj.actuators import (
     BUILT_IN,
     ActuatorModel,
     Family,
-    UnstableError,
     family_id,
     import_path,
     parameters_type,
-    stability,
 )
 from codrl_mj.actuators.noise import MAX_KEY
+from codrl_mj.engine import shafts
 from codrl_mj.engine.families import (
     SIGNATURE,
     USER_HEADER_SIZE,
@@ -26,7 +24,6 @@ from codrl_mj.engine.families import (
     signals_offset,
     slot_size,
 )
-from codrl_mj.engine.model_access import shaft_inertia
 from codrl_mj.engine.mounting import arm_outside_gear
 from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEADER_SIZE, REASONS
 from codrl_mj.plugin import FAMILY, NAME, registered_plugins
@@ -217,9 +214,6 @@ def check_shafts(
 ) -> float:
     """Raise an error if actuators are unstable with the joints that they move.
 
-    The check linearizes joints and actuators at the model's initial position. It ignores gravity,
-    springs, contacts, limits and the model's own servos.
-
     Args:
         model: a compiled model.
         allow_unstable: True to return instead of raising an error.
@@ -228,159 +222,20 @@ def check_shafts(
         explicit: True if positions are integrated with the previous speeds (explicit Euler).
 
     Returns:
-        The spectral radius of all position and speed loops together; 0 if there are none.
+        See `codrl_mj.engine.shafts.check_shafts`.
 
     Raises:
         UnstableError: the loops are unstable; the message has the spectral radius and a remedy.
     """
-    loop_actuators = {
+    closing = {
         index: actuator
         for index, actuator in (actuators or motors(model)).items()
         if actuator.closes_loops
     }
-    if not loop_actuators:
-        return 0.0
-    data = mujoco.MjData(model)
-    mujoco.mj_fwdPosition(model, data)
-    shafts, inertias = (
-        [(model.actuator_trntype[index], *model.actuator_trnid[index]) for index in loop_actuators],
-        [],
+    arms = {index: arm_outside_gear(model, index, motor) for index, motor in closing.items()}
+    return shafts.check_shafts(
+        model, closing, arms, allow_unstable, held, explicit, compiled_advance
     )
-    names = [model.actuator(index).name or f"actuator {index}" for index in loop_actuators]
-    for (index, actuator), shaft, name in zip(loop_actuators.items(), shafts, names, strict=True):
-        arm = arm_outside_gear(model, index, actuator)
-        inertias.append(shaft_inertia(model, data, model.actuator_outadr[index], 1.0 / arm))
-        try:
-            # Motors on the same shaft share its inertia equally; each is checked with its share.
-            num_on_shaft = shafts.count(shaft)
-            actuator.check_shaft(
-                model.opt.timestep, inertias[-1] / num_on_shaft, num_on_shaft > 1 or held
-            )
-        except UnstableError as error:
-            if not allow_unstable:
-                raise UnstableError(f"{name}: {error}") from None
-    spectral_radius, linear = _loop_radius(model, data, loop_actuators, inertias, held, explicit)
-    step = model.opt.timestep
-    largest = spectral_radius(step)
-    if largest < MAX_STABLE_RADIUS or allow_unstable:
-        return largest
-    separate_radii = {number: spectral_radius(step, number) for number in linear}
-    worst = max(separate_radii, key=separate_radii.__getitem__)
-    coupled = separate_radii[worst] < MAX_STABLE_RADIUS
-    remedy = list(loop_actuators.values())[worst].loop_remedy(inertias[worst])
-    raise UnstableError(
-        f"{', '.join(names[number] for number in linear) if coupled else names[worst]}: the"
-        f" outer loops are unstable{' together' * coupled}: spectral radius {largest:.4g} over a"
-        f" mechanical step of {step:g} s, must be < 1. {remedy}"
-        f" {_shorter_step(loop_actuators.values(), spectral_radius, step)}; or pass"
-        " allow_unstable=True"
-    )
-
-
-def _loop_radius(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    actuators: Mapping[int, ActuatorModel],
-    inertias: Sequence[float],
-    held: bool,
-    explicit: bool,
-) -> tuple[Callable[..., float], list[int]]:
-    """Return a function for the spectral radius, and the numbers of the linear actuators.
-
-    The function takes a step [s] and the numbers, in the order of `actuators`, of those whose loops
-    are closed; without numbers, the loops of all linear actuators are closed.
-    """
-    joints, motors = _joints(model, data, actuators, explicit), list(actuators.values())
-    # Compiled and plain functions take the same arguments.
-    advances: list[Callable[..., Any]] = [
-        motor.advance if held else compiled_advance(type(motor)) for motor in motors
-    ]
-    known_inertias = [
-        inertia if motor.INERTIA and not held else np.inf
-        for motor, inertia in zip(motors, inertias, strict=True)
-    ]
-
-    def linearized(number: int, timestep: float, size: float = 1.0) -> np.ndarray:
-        change = size * stability.PERTURBATION
-        return stability.linearize(
-            motors[number], advances[number], timestep, known_inertias[number], change
-        )
-
-    def is_smooth(number: int) -> bool:
-        small, large = (linearized(number, model.opt.timestep, size) for size in (1.0, 10.0))
-        return np.allclose(small, large, rtol=0.01, atol=1e-6 * np.abs(small).max())
-
-    def spectral_radius(timestep: float, *numbers: int) -> float:
-        closed = list(numbers or linear)
-        loops = [linearized(number, timestep) for number in closed]
-        shafts = joints._replace(moments=joints.moments[closed])
-        return stability.loop_radius(shafts, loops, timestep) if closed else 0.0
-
-    # A custom family may have friction or backlash at rest, which a linearized loop cannot
-    # describe.
-    linear = [
-        number
-        for number, motor in enumerate(motors)
-        if type(motor) in BUILT_IN or is_smooth(number)
-    ]
-    return spectral_radius, linear
-
-
-MAX_STABLE_RADIUS = 1.0 + 1e-6
-"""Spectral radius below which loops count as stable.
-
-Joints without any force have a radius of 1, and rounding may raise it.
-"""
-
-
-def _shorter_step(
-    actuators: Collection[ActuatorModel], radius_at: Callable[[float], float], timestep: float
-) -> str:
-    """Return a remedy: the longest of several shorter steps [s] that make the loops stable."""
-    for parts in (2, 3, 4, 5, 8, 10, 16, 20, 32, 50, 100):
-        try:
-            for actuator in actuators:
-                actuator.check(timestep / parts)
-        except ValueError:
-            continue
-        if (radius := radius_at(timestep / parts)) < MAX_STABLE_RADIUS:
-            return (
-                f"Or shorten the step to {timestep / parts:g} s, which makes them stable"
-                f" (spectral radius {radius:.4g})"
-            )
-    return "A shorter step does not help"
-
-
-def _joints(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    actuators: Mapping[int, ActuatorModel],
-    explicit: bool,
-) -> stability.Joints:
-    """Return a model's linearized joints at the data's position, with some actuators' shafts."""
-    inertia, all_moments = (
-        np.empty((model.nv, model.nv)),
-        np.zeros((len(data.moment_rownnz), model.nv)),
-    )
-    for row, unit in zip(inertia, np.eye(model.nv), strict=True):
-        mujoco.mj_mulM(model, data, row, unit)
-    mujoco.mju_sparse2dense(
-        all_moments,
-        data.actuator_moment,
-        data.moment_rownnz,
-        data.moment_rowadr,
-        data.moment_colind,
-    )
-    arms = [arm_outside_gear(model, index, actuator) for index, actuator in actuators.items()]
-    moments = all_moments[model.actuator_outadr[list(actuators)]] / np.array(arms)[:, np.newaxis]
-    engine_integrator, undamped = (
-        model.opt.integrator,
-        model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP,
-    )
-    is_rk4 = engine_integrator == mujoco.mjtIntegrator.mjINT_RK4
-    integrator = "rk4" if is_rk4 else "euler" if explicit else "semi-implicit"
-    undamped = undamped and engine_integrator == mujoco.mjtIntegrator.mjINT_EULER
-    return stability.Joints(inertia, model.dof_damping.copy(), moments, integrator, bool(undamped))
 
 
 class Readout:

@@ -10,9 +10,9 @@ from gymnasium import spaces
 from codrl_mj.actuators import ActuatorModel, Command, Drive, Ideal, Servo
 from codrl_mj.boundary import Action
 from codrl_mj.disturbances import NO_DISTURBANCES, Disturbances, check_delay
+from codrl_mj.engine.matching import ON_JOINT
 from codrl_mj.engine.reading import actuators_sharing_motor
 from codrl_mj.engine.reading import motors as motors_of
-from codrl_mj.engine.specs import ON_JOINT
 from codrl_mj.envs.config import EnvConfig, Space
 from codrl_mj.physics.base import Force
 from codrl_mj.physics.disturber import Disturber

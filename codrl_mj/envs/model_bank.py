@@ -10,8 +10,8 @@ from codrl_mj.actuators import ActuatorModel, Family, Inputs, parameters_type
 from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.boundary import Info
 from codrl_mj.engine.families import USER_HEADER_SIZE, signals_offset
+from codrl_mj.engine.matching import match_pattern, matchable_names
 from codrl_mj.engine.reading import Readout, actuators_sharing_motor, bring_to_rest, motor_slots
-from codrl_mj.engine.specs import match_pattern, matchable_names
 from codrl_mj.envs.bank import ActuatorBank, needs_key, sensor_names
 from codrl_mj.envs.commands import ControlCommands, commands_by_pattern
 from codrl_mj.envs.config import EnvConfig, Space

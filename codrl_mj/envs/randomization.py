@@ -23,9 +23,9 @@ from codrl_mj.actuators import (
     parameter_paths,
 )
 from codrl_mj.boundary import Info
+from codrl_mj.engine.matching import match_pattern, matchable_names
 from codrl_mj.engine.mounting import joint_addresses, set_arm_in_gear
 from codrl_mj.engine.reading import actuators_sharing_motor, check_shafts
-from codrl_mj.engine.specs import match_pattern, matchable_names
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_pattern
 from codrl_mj.fields import did_you_mean
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics

@@ -159,7 +159,7 @@ class TaskEnvSource(EnvSource):
     def _by_pattern(self, patterns: Mapping[str, object]) -> Info:
         """Return motor -> actuator, from a mapping of patterns of motor names to actuators."""
         # A local import, because the module imports numba, which takes long.
-        from codrl_mj.engine.specs import match_pattern, split_pattern
+        from codrl_mj.engine.matching import match_pattern, split_pattern
 
         names, actuators_by_motor = [[motor] for motor in self.task.motors], {}
         for pattern, actuator in patterns.items():

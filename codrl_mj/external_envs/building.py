@@ -10,7 +10,8 @@ import mujoco
 
 from codrl_mj.actuators import ActuatorModel, ActuatorSetting
 from codrl_mj.boundary import Argument
-from codrl_mj.engine.specs import add_motors, match_pattern, matchable_names, resolve_patterns
+from codrl_mj.engine.matching import match_pattern, matchable_names, resolve_patterns
+from codrl_mj.engine.specs import add_motors
 from codrl_mj.envs.commands import commands_by_pattern
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.tasks import TASKS

@@ -105,7 +105,7 @@ class ExternalEnvSource(EnvSource):
 
     def actuators(self, actuator: object) -> dict[str, ActuatorModel]:
         """Return the actuators as the configuration stores them: pattern -> `ActuatorModel`."""
-        from codrl_mj.engine.specs import resolve_patterns
+        from codrl_mj.engine.matching import resolve_patterns
 
         return resolve_patterns(
             actuators_by_pattern(actuator, self.default_actuator), f"the environment {self.name}"
@@ -118,8 +118,8 @@ class ExternalEnvSource(EnvSource):
 
     def override_actuators(self, config: EnvConfig, patterns: Mapping[str, object]) -> Info:
         """Return pattern -> actuator: `patterns`, and the configuration's for all other motors."""
+        from codrl_mj.engine.matching import match_pattern, matchable_names
         from codrl_mj.engine.reading import actuators_sharing_motor
-        from codrl_mj.engine.specs import match_pattern, matchable_names
 
         if all(configured == IDEAL for configured in config.actuators):
             return dict(patterns)

@@ -4,8 +4,8 @@ import mujoco
 
 from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel, Ideal, JointAdditions
-from codrl_mj.engine import HILL_NAMES
 from codrl_mj.engine.families import SIGNATURE, slot_size, user_header
+from codrl_mj.engine.hill import HILL_NAMES
 from codrl_mj.engine.mounting import is_in_callback
 from codrl_mj.engine.reading import motors
 from codrl_mj.physics.base import SimulationConfig

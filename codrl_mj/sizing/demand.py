@@ -224,8 +224,8 @@ def _demands_from_episodes(
     """Return the demands on all motors from episodes of one environment."""
     import mujoco
 
+    from codrl_mj.engine.matching import ON_JOINT
     from codrl_mj.engine.reading import motors
-    from codrl_mj.engine.specs import ON_JOINT
 
     swing, goal_masks = None, [at_goal(env.source.task, episode) for episode in episodes]
     if all(mask is not None for mask in goal_masks):

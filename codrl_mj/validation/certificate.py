@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import mujoco
 
-from codrl_mj.engine.specs import NO_ACTUATORS_READ
+from codrl_mj.engine.matching import NO_ACTUATORS_READ
 from codrl_mj.physics import install_callbacks, motors
 from codrl_mj.tasks import PAPER_TASKS, TASKS, find_task
 from codrl_mj.validation import execution, own_model

@@ -30,12 +30,11 @@ from codrl_mj.actuators import (
     parameters_type,
     spectral_radius,
 )
-from codrl_mj.engine import load_family
-from codrl_mj.engine.families import SLOT_HEADER_SIZE, SlotHeader
+from codrl_mj.engine.families import SLOT_HEADER_SIZE, SlotHeader, load_family
+from codrl_mj.engine.joint_dynamics import describe_duplicate_dynamics
 from codrl_mj.engine.model_access import shaft_inertia
 from codrl_mj.engine.mounting import arm_outside_gear, desired_input
 from codrl_mj.engine.reading import actuators_sharing_motor, motor_slots
-from codrl_mj.engine.specs import describe_duplicate_dynamics
 from codrl_mj.physics import SimulationConfig, install_callbacks, motors
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.variation import without_additions

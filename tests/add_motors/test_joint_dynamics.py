@@ -9,8 +9,7 @@ import pytest
 
 import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply, TorqueSpeed
-from codrl_mj.engine import specs
-from codrl_mj.engine.specs import MotorWarning
+from codrl_mj.engine.joint_dynamics import MotorWarning
 from codrl_mj.validation import validate_model
 
 _ARM = """
@@ -42,7 +41,7 @@ STALL, FREE = RATIO * CONSTANT * VOLTS / OHMS, VOLTS / (CONSTANT * RATIO)
 
 @pytest.fixture(autouse=True)
 def _nothing_warned(monkeypatch):
-    monkeypatch.setattr(specs, "_WARNED", set())
+    monkeypatch.setattr("codrl_mj.engine.joint_dynamics._WARNED", set())
 
 
 def _arm(attributes=OWN, gear=1.0):

@@ -10,7 +10,7 @@ import pytest
 import codrl_mj
 from codrl_mj.actuators import Lag, Servo, TorqueSpeed
 from codrl_mj.engine import motors
-from codrl_mj.engine.specs import MotorWarning
+from codrl_mj.engine.joint_dynamics import MotorWarning
 from codrl_mj.sizing.choice import actuators_of
 from codrl_mj.validation import validate_model
 from tests.add_motors.models import INTEGRATORS
