@@ -6,14 +6,16 @@ text uses doubles and 64-bit integers, and computes exactly what the source comp
 
 import math
 import re
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Sequence
+from typing import Literal, NamedTuple
 
 from codrl_mj.actuators import ActuatorModel, Family, Inputs, family_name, parameters_type
 from codrl_mj.arrays.family import read_advance
 from codrl_mj.arrays.scalars import Kind, Scalar, ScalarLoop
 
-_TYPES: dict[Kind, str] = {"bool": "int", "int": "long long", "float": "double"}
+Real = Literal["double", "float"]
+"""Type of floats in C."""
+_TYPES: dict[Kind, str] = {"bool": "int", "int": "long long"}
 _INFIX = {
     "add": "+",
     "sub": "-",
@@ -37,6 +39,8 @@ _WRAPPING = {"add": "+", "sub": "-", "mul": "*", "shl": "<<"}
 DEFAULT_NAME = "advance_actuator"
 """Name of the C function, unless the user chooses another."""
 _MAX_INT = "9223372036854775807LL"
+_MAX_FLOAT = 3.4028234663852886e38
+"""Largest number of a 32-bit float."""
 
 
 class CCode:
@@ -46,13 +50,16 @@ class CCode:
         portable: True to write `expm1`, `log1p`, `hypot` and `copysign` in terms of other
             functions, because Warp has none of them on a CPU. The results then differ in the last
             digits.
+        real: type of floats; with `float`, no statement computes with doubles.
     """
 
-    def __init__(self, portable: bool = False) -> None:
+    def __init__(self, portable: bool = False, real: Real = "double") -> None:
         """Start with no statements."""
         self.lines: list[str] = []
         """Statements, one a line."""
         self._portable = portable
+        self._types: dict[Kind, str] = {**_TYPES, "float": real}
+        self._suffix = "f" if real == "float" else ""
         self._count = 0
         self._indent = 1
 
@@ -61,25 +68,31 @@ class CCode:
         if kind != "float":
             text = f"{abs(int(value))}LL" if kind == "int" else f"{int(value)}"
         elif math.isnan(value):
-            return "(0.0 / 0.0)"
-        elif math.isinf(value):
+            return f"({self._number(0.0)} / {self._number(0.0)})"
+        elif math.isinf(value) or (self._suffix and abs(value) > _MAX_FLOAT):
             # Warp has no HUGE_VAL on a CPU, and strict C compilers warn of the overflow.
-            text = "(1e300 * 1e300)" if self._portable else "HUGE_VAL"
+            huge = f"1e{30 if self._suffix else 300}{self._suffix}"
+            text = f"({huge} * {huge})" if self._portable or self._suffix else "HUGE_VAL"
         else:
-            text = repr(abs(float(value)))
+            text = f"{abs(float(value))!r}{self._suffix}"
         return f"(-{text})" if math.copysign(1.0, value) < 0.0 else text
+
+    def _number(self, value: float) -> str:
+        """Return the literal of a float that is written in a replacement of a function."""
+        return self.constant(value, "float")
 
     def convert(self, operand: str, old: Kind, new: Kind) -> str:
         """Write a conversion, and return the name of its result."""
         if new == "bool":
             return self._define("bool", f"{operand} != 0")
         if (old, new) != ("float", "int"):
-            return self._define(new, f"({_TYPES[new]}){operand}")
+            return self._define(new, f"({self._types[new]}){operand}")
         # C leaves the result undefined if the float is NaN or too large for an int.
+        limit = self._number(9.2e18)
         return self._define(
             "int",
-            f"{operand} != {operand} ? 0LL : {operand} >= 9.2e18 ? {_MAX_INT}"
-            f" : {operand} <= -9.2e18 ? -{_MAX_INT} : (long long){operand}",
+            f"{operand} != {operand} ? 0LL : {operand} >= {limit} ? {_MAX_INT}"
+            f" : {operand} <= -{limit} ? -{_MAX_INT} : (long long){operand}",
         )
 
     def operation(self, name: str, kind: Kind, *operands: str) -> str:
@@ -111,12 +124,16 @@ class CCode:
         expressions = {
             "neg": f"-{first}",
             "not": f"!{first}",
-            "abs": f"fabs({first})",
+            "abs": f"{self._function('fabs')}({first})",
             "isinf": f"{first} == {infinity} || {first} == -{infinity}",
             "isnan": f"{first} != {first}",
-            "isfinite": f"{first} - {first} == 0.0",
+            "isfinite": f"{first} - {first} == {self._number(0.0)}",
         }
-        return expressions.get(name, f"{name}({', '.join(operands)})")
+        return expressions.get(name, f"{self._function(name)}({', '.join(operands)})")
+
+    def _function(self, name: str) -> str:
+        """Return the name of a function of the math library for the type of floats."""
+        return name + self._suffix
 
     def _divide(self, name: str, kind: Kind, left: str, right: str) -> str:
         """Write Python's floor division or remainder, which has the sign of the divisor."""
@@ -130,15 +147,16 @@ class CCode:
                 return self._define("int", f"{quotient} - {is_below}")
             return self._define("int", f"{is_below} ? {remainder} + {right} : {remainder}")
         # The same steps as in Python, which are exact to the last bit.
-        remainder = self._define("float", f"fmod({left}, {right})")
+        zero, half, unit = map(self._number, (0.0, 0.5, 1.0))
+        remainder = self._define("float", f"{self._function('fmod')}({left}, {right})")
         is_below = self._define(
-            "bool", f"{remainder} != 0.0 && ({remainder} < 0.0) != ({right} < 0.0)"
+            "bool", f"{remainder} != {zero} && ({remainder} < {zero}) != ({right} < {zero})"
         )
         if name == "mod":
             return self._define("float", f"{is_below} ? {remainder} + {right} : {remainder}")
         quotient = self._define("float", f"({left} - {remainder}) / {right} - {is_below}")
-        whole = self._define("float", f"floor({quotient})")
-        return self._define("float", f"{quotient} - {whole} > 0.5 ? {whole} + 1.0 : {whole}")
+        whole = self._define("float", f"{self._function('floor')}({quotient})")
+        return self._define("float", f"{quotient} - {whole} > {half} ? {whole} + {unit} : {whole}")
 
     def branch(
         self,
@@ -195,13 +213,13 @@ class CCode:
         """Write the declaration of a variable, and return its name."""
         self._count += 1
         name = f"v{self._count}"
-        self._line(f"{_TYPES[kind]} {name}{f' = {value}' if value else ''};")
+        self._line(f"{self._types[kind]} {name}{f' = {value}' if value else ''};")
         return name
 
     def _define(self, kind: Kind, text: str) -> str:
         """Write the definition of a constant, and return its name."""
         self._count += 1
-        self._line(f"const {_TYPES[kind]} v{self._count} = {text};")
+        self._line(f"const {self._types[kind]} v{self._count} = {text};")
         return f"v{self._count}"
 
     def _line(self, text: str) -> None:
@@ -209,30 +227,36 @@ class CCode:
 
     def _expm1(self, x: str) -> str:
         """Write Kahan's formula for exp(x) - 1, whose error is a few units in the last place."""
-        u = self._define("float", f"exp({x})")
-        text = f"{u} == 1.0 ? {x} : {u} - 1.0 == -1.0 || {u} > 1e30 ? {u} - 1.0"
-        return self._define("float", f"{text} : ({u} - 1.0) * {x} / log({u})")
+        unit, large = self._number(1.0), self._number(1e30)
+        u = self._define("float", f"{self._function('exp')}({x})")
+        text = f"{u} == {unit} ? {x} : {u} - {unit} == -{unit} || {u} > {large} ? {u} - {unit}"
+        return self._define(
+            "float", f"{text} : ({u} - {unit}) * {x} / {self._function('log')}({u})"
+        )
 
     def _log1p(self, x: str) -> str:
         """Write Kahan's formula for log(1 + x)."""
-        u = self._define("float", f"1.0 + {x}")
-        text = f"{u} == 1.0 ? {x} : {u} - {u} != 0.0 || {u} <= 0.0 ? log({u})"
-        return self._define("float", f"{text} : log({u}) * {x} / ({u} - 1.0)")
+        zero, unit, log = self._number(0.0), self._number(1.0), self._function("log")
+        u = self._define("float", f"{unit} + {x}")
+        text = f"{u} == {unit} ? {x} : {u} - {u} != {zero} || {u} <= {zero} ? {log}({u})"
+        return self._define("float", f"{text} : {log}({u}) * {x} / ({u} - {unit})")
 
     def _hypot(self, x: str, y: str) -> str:
         """Write the length of a vector, scaled against overflow."""
-        large = self._define("float", f"fabs({x}) > fabs({y}) ? fabs({x}) : fabs({y})")
+        fabs, zero = self._function("fabs"), self._number(0.0)
+        large = self._define("float", f"{fabs}({x}) > {fabs}({y}) ? {fabs}({x}) : {fabs}({y})")
         divisor = self._define(
-            "float", f"{large} > 0.0 && {large} - {large} == 0.0 ? {large} : 1.0"
+            "float",
+            f"{large} > {zero} && {large} - {large} == {zero} ? {large} : {self._number(1.0)}",
         )
         a, b = (self._define("float", f"{value} / {divisor}") for value in (x, y))
-        return self._define("float", f"{divisor} * sqrt({a} * {a} + {b} * {b})")
+        return self._define("float", f"{divisor} * {self._function('sqrt')}({a} * {a} + {b} * {b})")
 
     def _copysign(self, x: str, y: str) -> str:
         """Write x with the sign of y; 1/y tells the sign of a zero."""
-        return self._define(
-            "float", f"{y} < 0.0 || ({y} == 0.0 && 1.0 / {y} < 0.0) ? -fabs({x}) : fabs({x})"
-        )
+        fabs, zero, unit = self._function("fabs"), self._number(0.0), self._number(1.0)
+        is_negative = f"{y} < {zero} || ({y} == {zero} && {unit} / {y} < {zero})"
+        return self._define("float", f"{is_negative} ? -{fabs}({x}) : {fabs}({x})")
 
 
 _REPLACEMENTS: dict[str, Callable[..., str]] = {
@@ -247,7 +271,7 @@ class CProgram(NamedTuple):
     """A family's `advance` as C: statements, and the expressions of their results.
 
     The statements read variables `p_NAME` (parameters), `s_NAME` (state), `x_NAME` (inputs) and
-    `timestep`, all of them doubles.
+    `timestep`, all of them doubles, or floats if the program is one of floats.
     """
 
     statements: list[str]
@@ -260,22 +284,33 @@ class CProgram(NamedTuple):
     """Expressions of the signals."""
 
 
-def c_program(actuator: ActuatorModel | Family, portable: bool = False) -> CProgram:
+def c_program(
+    actuator: ActuatorModel | Family,
+    portable: bool = False,
+    real: Real = "double",
+    variables: Collection[str] = (),
+) -> CProgram:
     """Return a family's `advance` as statements of C, for a function or a kernel around them.
 
     Args:
         actuator: an actuator, whose parameters become constants, or a family.
         portable: True to call only functions that Warp has on a CPU; see `CCode`.
+        real: type of floats. In 32 bits a noise key is exact below 2**24 only.
+        variables: names of parameters that become no constants, as in `parameters_type`.
 
     Raises:
         UnsupportedError: the source contains a construct that the reader does not take.
+        ValueError: the type is neither double nor float.
     """
+    if real not in ("double", "float"):
+        raise ValueError(f"real = {real!r}: must be 'double' or 'float'")
     family = _family(actuator)
-    backend = CCode(portable)
+    backend = CCode(portable, real)
     names = parameters_type(family)._fields
     parameters = _symbols("p", names)
     if isinstance(actuator, ActuatorModel):
-        parameters = dict(zip(names, actuator.parameter_values, strict=True))
+        values = zip(names, actuator.parameter_values, strict=True)
+        parameters |= {name: value for name, value in values if name not in variables}
     result = read_advance(
         family,
         backend,

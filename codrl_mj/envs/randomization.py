@@ -16,7 +16,6 @@ from codrl_mj.actuators import (
     Family,
     Ideal,
     UnstableError,
-    choices_of,
     field_paths,
     field_values,
     from_array,
@@ -26,7 +25,8 @@ from codrl_mj.boundary import Info
 from codrl_mj.engine.matching import match_pattern, matchable_names
 from codrl_mj.engine.mounting import joint_addresses, set_arm_in_gear
 from codrl_mj.engine.reading import actuators_sharing_motor, check_shafts
-from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_pattern
+from codrl_mj.envs.distributions import MODEL, Distribution, split_pattern
+from codrl_mj.envs.motor_fields import check_motor_field, depends_on, type_of_field
 from codrl_mj.fields import did_you_mean
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.physics.variation import (
@@ -92,7 +92,7 @@ class Randomization:
                 path
                 for path, motor_indices in matched.items()
                 if any(
-                    _depends_on(quantity, actuators[motor_index], path)
+                    depends_on(quantity, actuators[motor_index], path)
                     for motor_index in motor_indices
                 )
             ]
@@ -103,9 +103,7 @@ class Randomization:
         )
         model_only_paths = [path for path, motor_indices in matched.items() if not motor_indices]
         self.types = {
-            path: _type_of_field(type(actuators[motor_indices[0]]), path)
-            if motor_indices
-            else float
+            path: type_of_field(type(actuators[motor_indices[0]]), path) if motor_indices else float
             for path, motor_indices in matched.items()
         }
         """Path -> type of the field: float, int or bool."""
@@ -473,8 +471,8 @@ def _match_motors(
             if not motor_indices:
                 _check_model_factor(field, distribution)
             for motor in motor_indices:
-                _check_motor_field(field, distribution, actuators[motor], fixed[motor])
-                if not allows_friction[motor] and _depends_on(
+                check_motor_field(field, distribution, actuators[motor], fixed[motor])
+                if not allows_friction[motor] and depends_on(
                     lambda actuator: actuator.additions.friction, actuators[motor], field
                 ):
                     raise ValueError(
@@ -522,56 +520,3 @@ def _check_model_factor(field: str, distribution: Distribution) -> None:
         raise ValueError(
             f"{field} = {low:g}: must be a finite number {'>=' if allowed_zero else '>'} 0"
         )
-
-
-def _check_motor_field(
-    field: str, distribution: Distribution, motor: ActuatorModel, fixed: Mapping[str, str]
-) -> None:
-    """Raise if a motor's field cannot be drawn from a distribution."""
-    if isinstance(motor, Ideal):
-        raise ValueError(
-            "the ideal actuator has no motor and no controller to draw; choose another actuator"
-        )
-    if field in fixed:
-        raise ValueError(f"{fixed[field]}; draw it with action='force'")
-    field_type, choices = _type_of_field(type(motor), field), choices_of(type(motor), field)
-    if choices:
-        if not isinstance(distribution, Choice) or any(
-            value not in range(len(choices)) for value in distribution.values
-        ):
-            numbered = ", ".join(f"{index} for {word}" for index, word in enumerate(choices))
-            raise ValueError(f"{field} is a word: draw it from a Choice of {numbered}")
-    elif field_type is not float:
-        if not isinstance(distribution, Choice) or any(
-            type(value) is not field_type for value in distribution.values
-        ):
-            raise ValueError(f"{field} must be drawn from a Choice of {field_type.__name__} values")
-    elif any(isinstance(value, bool) for value in distribution.extremes):
-        raise ValueError(f"{field} must be a number")
-    for value in distribution.extremes:
-        # Building the actuator checks the bounds of the field itself.
-        motor.replaced({field: value})
-
-
-def _type_of_field(family: Family, path: str) -> type:
-    """Return the type of a family's field: float, int or bool."""
-    value: object = family()
-    for part in split_pattern(path)[1].split("."):
-        value = getattr(value, part, None)
-    return type(value) if isinstance(value, int) else float
-
-
-def _depends_on(
-    quantity: Callable[[ActuatorModel], object], motor: ActuatorModel, path: str
-) -> bool:
-    """Return True if a quantity of a motor depends on a field.
-
-    A factor of 0 would hide the dependence, so the test is repeated with all fields at 2.
-    """
-    family: Family = type(motor)
-    fields, field = field_paths(family), split_pattern(path)[1]
-    for values in (field_values(motor), (2.0,) * len(fields)):
-        changed = [value + (name == field) for name, value in zip(fields, values, strict=True)]
-        if quantity(from_array(family, values)) != quantity(from_array(family, changed)):
-            return True
-    return False

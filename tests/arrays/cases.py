@@ -342,8 +342,12 @@ def case(name, num):
 
 @functools.cache
 def expected(name, num):
+    """Return `python_results` of the actuators of a case."""
+    return python_results(case(name, num))
+
+
+def python_results(actuators):
     """Return states, torques and signals by the plain Python of the family, shape (n, s+1+k)."""
-    actuators = case(name, num)
     types = parameters_type(actuators.family), actuators.family.State, Inputs
     tables = actuators.parameters, actuators.state, actuators.inputs
     results = []
@@ -355,11 +359,15 @@ def expected(name, num):
 
 
 def errors(name, num, results):
+    """Return `errors_of` the results of a case."""
+    return errors_of(case(name, num), expected(name, num), results)
+
+
+def errors_of(actuators, values, results):
     """Return the errors of results, relative to the values or, if greater, their natural units.
 
     Flags are compared for equality: the error of a flag is 0 or infinite.
     """
-    actuators, values = case(name, num), expected(name, num)
     fields = (*actuators.family.State._fields, "torque", *actuators.family.Signals._fields)
     with np.errstate(invalid="ignore", divide="ignore"):
         size = np.maximum(np.abs(values), actuators.scales)

@@ -1,0 +1,1 @@
+"""Tests that run other simulators: `make simulators` installs them."""
