@@ -7,9 +7,14 @@ DOCS := .venv/.installed-docs
 MUJOCO4 := .venv-mujoco4
 MUJOCO4_TESTS := tests/engine tests/physics tests/add_motors tests/envs tests/conformance tests/tasks tests/external_envs \
 	tests/test_compile_cache.py
+SIMULATORS := .venv-simulators
+# mjlab asks for MuJoCo 3.11 and mujoco_warp 4.0 for MuJoCo 4; both run on MuJoCo 3.17, so they are installed without
+# the packages that they ask for.
+SIMULATOR_PACKAGES := warp-lang==1.19.0 mujoco-warp==4.0.0 mujoco-mjx==3.17.0 jax==0.10.2 jaxlib==0.10.2 \
+	opt_einsum==3.4.0 mjlab==1.6.0 mediapy==1.2.7 prettytable==3.18.0
 INSTALL = $(BIN)/pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: install demo test check mujoco4 browser lint bench soak results docs pictures clean
+.PHONY: install demo test check mujoco4 simulators browser lint bench soak results docs pictures clean
 
 install: $(STAMP)
 
@@ -59,6 +64,18 @@ mujoco4: $(MUJOCO4)/.installed  ## the engine's tests and the certificate on MuJ
 		$(MUJOCO4_WITHOUT) $(MUJOCO4_TESTS)
 	@$(MUJOCO4)/bin/python -m codrl_mj validate --quick
 
+$(SIMULATORS)/.installed: pyproject.toml constraints.txt Makefile
+	@test -x $(SIMULATORS)/bin/python || $(PYTHON) -m venv $(SIMULATORS)
+	@echo "installing other simulators and the packages of their tests into $(SIMULATORS) ..."
+	@$(SIMULATORS)/bin/pip install --quiet --constraint constraints.txt --editable ".[train,render,view]" \
+		etils ml_dtypes wcwidth hypothesis pytest pytest-xdist
+	@$(SIMULATORS)/bin/pip install --quiet --no-deps $(SIMULATOR_PACKAGES)
+	@touch $@
+
+simulators: $(SIMULATORS)/.installed  ## motors in mujoco_warp, MJX and mjlab, and actuators as Warp and JAX code
+	@$(SIMULATORS)/bin/python -m pytest -m "not slow and not matrix and not browser" -n 2 --dist loadfile --no-loadscope-reorder \
+		tests/simulators tests/arrays
+
 node_modules/axe-core:
 	@npm install --no-save --silent axe-core@4.14.1
 
@@ -93,5 +110,5 @@ pictures: $(STAMP)  ## for README, gallery and pages: takes half an hour, and ne
 	@$(BIN)/python scripts/pictures.py
 
 clean:  ## remove everything except trained runs
-	rm -rf .venv $(MUJOCO4) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf .venv $(MUJOCO4) $(SIMULATORS) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

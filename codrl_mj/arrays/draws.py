@@ -96,8 +96,8 @@ class WorldDraws:
         last = {path: float(column[pending[0]]) for path, column in values.items()}
         raise ValueError(
             f"randomize: {MAX_REDRAWS} draws in a row are unstable at a step of"
-            f" {self._robot.timestep:g} s; the last was {last}. Narrow the bounds, shorten the step,"
-            " or pass allow_unstable=True"
+            f" {self._robot.timestep:g} s; the last was {last}. Narrow the bounds, shorten the"
+            " step, or pass allow_unstable=True"
         )
 
     def _unstable(self, values: Mapping[str, np.ndarray], num_worlds: int) -> np.ndarray:

@@ -208,7 +208,7 @@ def attach_motors(
             " checked: set it in the spec before `prepare_model`"
         )
     known = {path for motor in robot.motors for path in _paths(motor)}
-    check_names(varying, known, "parameter", "varying: ")
+    check_names(varying, known, "parameter")
     generator = np.random.default_rng(seed)
     draws = WorldDraws(robot, randomize)
     motors = AttachedMotors(robot, model, data, draws, generator, varying, per_world, real)

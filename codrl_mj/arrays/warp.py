@@ -107,7 +107,7 @@ class WarpActuators:
         self._num_rows = num_worlds if per_world else 1
         rows = np.array([actuator.parameter_values for actuator in actuators])
         paths = parameter_paths(self.family)
-        check_names(varying, paths.values(), "parameter", "varying: ")
+        check_names(varying, paths.values(), "parameter")
         self._variables = tuple(
             name
             for column, (name, path) in enumerate(paths.items())
@@ -204,7 +204,7 @@ class WarpActuators:
         """
         paths = parameter_paths(self.family)
         names = {path: name for name, path in paths.items() if name in self._variables}
-        check_names([path], paths.values(), "parameter", "")
+        check_names([path], paths.values(), "parameter")
         if path not in names:
             raise ValueError(f"{path}: is a constant of the kernel: name it in `varying`")
         shape = self._num_rows, len(self.actuators)
@@ -217,7 +217,7 @@ class WarpActuators:
             ValueError: the family has no such signal.
         """
         names = self.family.Signals._fields
-        check_names([name], names, "signal", "")
+        check_names([name], names, "signal")
         return _slice(self._signals, names.index(name), (self.num_worlds, len(self.actuators)))
 
     def state(self, name: str) -> Array:
@@ -227,7 +227,7 @@ class WarpActuators:
             ValueError: the family has no such entry.
         """
         names = self.family.State._fields
-        check_names([name], names, "entry of the state", "")
+        check_names([name], names, "entry of the state")
         return _slice(self._states, names.index(name), (self.num_worlds, len(self.actuators)))
 
     @property
