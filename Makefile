@@ -68,7 +68,7 @@ $(SIMULATORS)/.installed: pyproject.toml constraints.txt Makefile
 	@test -x $(SIMULATORS)/bin/python || $(PYTHON) -m venv $(SIMULATORS)
 	@echo "installing other simulators and the packages of their tests into $(SIMULATORS) ..."
 	@$(SIMULATORS)/bin/pip install --quiet --constraint constraints.txt --editable ".[train,render,view]" \
-		etils ml_dtypes wcwidth hypothesis pytest pytest-xdist
+		etils ipython ml_dtypes wcwidth hypothesis pytest pytest-xdist
 	@$(SIMULATORS)/bin/pip install --quiet --no-deps $(SIMULATOR_PACKAGES)
 	@touch $@
 

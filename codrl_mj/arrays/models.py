@@ -68,7 +68,7 @@ def prepare_model(
     """Put motors behind actuators of a model for another simulator.
 
     A motor's inertia and damping, times the square of the actuator's gear, and its friction are
-    added to the joint, because mujoco_warp and MJX ignore an actuator's `armature`. The model's
+    added to the joint, because MJX, and mujoco_warp before 4.0, ignore an actuator's `armature`. The model's
     actuator keeps its gain, bias and ranges. Its force is the command of the motor; behind a servo,
     it passes the control.
 
@@ -153,8 +153,8 @@ def _refused_kind(model: mujoco.MjModel, index: int) -> str:
         return f"it has activation dynamics, {dynamics.name}; use codrl_mj.add_motors"
     if model.actuator_armature[index] or np.any(model.actuator_damping[index]):
         return (
-            "it has an armature or a damping of its own, which mujoco_warp and MJX ignore: move"
-            " them to the joint, times the square of the gear"
+            "it has an armature or a damping of its own, which some simulators ignore: move them to"
+            " the joint, times the square of the gear"
         )
     if 0 <= group < mujoco.mjNGROUP and model.opt.disableactuator >> group & 1:
         return f"its group {group} is disabled"

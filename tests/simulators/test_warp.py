@@ -79,7 +79,8 @@ def test_torques_of_random_actuators_in_float_are_accurate(name):
     print(
         f"{name} in float: torque p99.9 {p999:.1e}, max {error[:, torque].max():.1e}, {flips} flags"
     )
-    assert p999 < 3e-5
+    # A servo's command is a difference of positions of up to 300 rad, which a 32-bit float rounds.
+    assert p999 < (5e-5 if name == "servo" else 3e-5)
     # A flag may differ only where a limit is met within the rounding of a float.
     assert flips <= 2
 
