@@ -68,9 +68,9 @@ def prepare_model(
     """Put motors behind actuators of a model for another simulator.
 
     A motor's inertia and damping, times the square of the actuator's gear, and its friction are
-    added to the joint, because MJX, and mujoco_warp before 4.0, ignore an actuator's `armature`. The model's
-    actuator keeps its gain, bias and ranges. Its force is the command of the motor; behind a servo,
-    it passes the control.
+    added to the joint, because MJX, and mujoco_warp before 4.0, ignore an actuator's `armature`.
+    The model's actuator keeps its gain, bias and ranges. Its force is the command of the motor;
+    behind a servo, it passes the control.
 
         >>> robot = prepare_model("robot.xml", {".*hip": "maxon-ec45-flat-50w", ".*knee": "lag"})
         >>> model = robot.spec.compile()

@@ -112,10 +112,10 @@ KINDS = {
 
 @pytest.mark.parametrize("reason", KINDS)
 def test_kinds_that_were_not_tested_are_refused_by_name(reason):
-    site, actuator, other = KINDS[reason]
+    site, actuator, element = KINDS[reason]
     spec = mujoco.MjSpec.from_string(
         f"<mujoco><worldbody><body><joint name='h'/><geom size='.1'/>{site}</body></worldbody>"
-        f"{other}<actuator>{actuator}</actuator></mujoco>"
+        f"{element}<actuator>{actuator}</actuator></mujoco>"
     )
     with pytest.raises(ValueError, match=f"actuator m.*another simulator: .*{reason}"):
         prepare_model(spec, {"m": "lag"})
@@ -160,8 +160,8 @@ def test_dynamics_that_count_twice_are_reported_or_removed():
         prepare_model(spec, actuators)
     replaced = prepare_model(spec, actuators, joint_dynamics="replace").spec.compile()
     assert replaced.dof_armature[0] == CATALOGUE_MOTOR.additions.armature
-    kept = prepare_model(spec, actuators, joint_dynamics="keep").spec.compile()
-    assert kept.dof_armature[0] == CATALOGUE_MOTOR.additions.armature + 0.02
+    summed = prepare_model(spec, actuators, joint_dynamics="keep").spec.compile()
+    assert summed.dof_armature[0] == CATALOGUE_MOTOR.additions.armature + 0.02
 
 
 @pytest.mark.filterwarnings("ignore:compiler attribute")

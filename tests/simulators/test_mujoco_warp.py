@@ -178,14 +178,16 @@ def test_reset_clears_the_motors_of_chosen_worlds_only():
 def test_forward_between_steps_changes_nothing(integrator):
     spec, actuators = two_joints(integrator), {"first": CATALOGUE_MOTOR, "second": "lag"}
     commands = two_joint_commands(1)[:200]
-    plain, other = Simulation(spec, actuators), Simulation(spec, actuators)
+    plain, interrupted = Simulation(spec, actuators), Simulation(spec, actuators)
 
     def forward(step):
         if step % 7 == 0:
-            other.data.ctrl.fill_(1.0)
-            mjw.forward(other.model, other.data)
+            interrupted.data.ctrl.fill_(1.0)
+            mjw.forward(interrupted.model, interrupted.data)
 
-    np.testing.assert_array_equal(plain.move(commands), other.move(commands, before_step=forward))
+    np.testing.assert_array_equal(
+        plain.move(commands), interrupted.move(commands, before_step=forward)
+    )
 
 
 def test_each_world_has_the_drawn_parameters_of_its_own():
@@ -285,9 +287,9 @@ def test_bounds_with_unstable_servos_are_refused():
 
 def test_a_model_of_another_robot_or_step_is_refused():
     robot = prepare_model(pendulum(), {"motor": "lag"})
-    other = two_joints().compile()
+    larger = two_joints().compile()
     with pytest.raises(ValueError, match=r"has 2 actuators, must be the compiled `robot.spec`"):
-        attach_motors(robot, mjw.put_model(other), mjw.make_data(other))
+        attach_motors(robot, mjw.put_model(larger), mjw.make_data(larger))
     compiled = robot.spec.compile()
     compiled.opt.timestep = 0.001
     with pytest.raises(ValueError, match="set it in the spec before `prepare_model`"):
