@@ -253,7 +253,7 @@ LIBRARIES = {
     "arrays.warp_inertia": {"warp"},
     "arrays.draws": {"mujoco", "numpy"},
     "arrays.mujoco_warp": {"mujoco", "numpy"},
-    "arrays.mjlab": {"mjlab", "mujoco", "torch", "warp"},
+    "arrays.mjlab": {"mjlab", "mujoco", "numpy", "torch", "warp"},
     "disturbances": {"numpy"},
     "tasks": {"numpy", "gymnasium", "mujoco"},
     "catalogue": {"pint"},

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import mujoco
+import numpy as np
 import torch
 import warp as wp
 from mjlab.actuator import Actuator, ActuatorCfg
@@ -51,6 +52,8 @@ class MotorActuatorCfg(ActuatorCfg):
     """Dotted paths of parameters that each environment has for itself, to be randomized."""
     allow_unstable: bool = False
     """True to accept a motor that is unstable at the model's step."""
+    seed: int = 0
+    """Seed of the noise of sensors, which differs in each environment."""
     real: Real = "double"
     """Precision in which the motor is computed; mjlab's is `float`."""
 
@@ -131,6 +134,8 @@ class MotorActuator(Actuator[MotorActuatorCfg]):
             device=self._data.qpos.device,
             real=self.cfg.real,
         )
+        if self.motors.family.RANDOM:
+            self.motors.draw_noise_keys(np.random.default_rng(self.cfg.seed))
         self._force = torch.zeros(self._data.nworld, len(columns), device=device)
         self._inertia = None
         if self.motor.INERTIA:

@@ -141,11 +141,11 @@ class AttachedMotors:
                     view.assign(table)
         return values
 
-    def set_noise_keys(self, generator: np.random.Generator) -> None:
-        """Give each sensor with noise a new key, so that each world has other random numbers."""
+    def draw_noise_keys(self) -> None:
+        """Give each sensor with noise a new key; call it at resets for other random numbers."""
         for group in self.groups:
-            shape = group.num_worlds, len(group.actuators)
-            group.set_noise_keys(generator.integers(0, group.max_noise_key, shape))
+            if group.family.RANDOM:
+                group.draw_noise_keys(self._generator)
 
 
 def _paths(motor: SimulatorMotor) -> Iterable[str]:
@@ -184,7 +184,7 @@ def attach_motors(
         model: model of mujoco_warp, from `robot.spec`.
         data: its data. Motors act in the data with these worlds only.
         randomize: distributions of parameters, drawn for each world, as for an environment.
-        seed: seed of the draws.
+        seed: seed of the draws, and of the keys of sensors' noise.
         varying: dotted paths of further parameters that can be changed.
         per_world: True if each world has its own parameters, also without `randomize`.
         real: precision of the motors; mujoco_warp's own is `float`.
@@ -214,6 +214,7 @@ def attach_motors(
     motors = AttachedMotors(robot, model, data, draws, generator, varying, per_world, real)
     if draws.distributions:
         motors.draw()
+    motors.draw_noise_keys()
     before: Any = model.callback.act_bias
 
     def act_bias(model: Model, data: Data) -> None:

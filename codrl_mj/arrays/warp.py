@@ -230,8 +230,13 @@ class WarpActuators:
         check_names([name], names, "entry of the state")
         return _slice(self._states, names.index(name), (self.num_worlds, len(self.actuators)))
 
+    def draw_noise_keys(self, generator: np.random.Generator) -> None:
+        """Give each actuator in each world another random key for its sensor's noise."""
+        shape = self.num_worlds, len(self.actuators)
+        self.set_noise_keys(generator.integers(0, self._max_noise_key, shape))
+
     @property
-    def max_noise_key(self) -> int:
+    def _max_noise_key(self) -> int:
         """Exclusive upper bound of the noise keys, which the tables hold exactly."""
         return MAX_KEY if self._scalar is wp.float64 else 2**24
 
@@ -241,7 +246,7 @@ class WarpActuators:
         Raises:
             ValueError: a key is no whole number from 0 to 2**53 - 1, or to 2**24 - 1 in floats.
         """
-        limit = self.max_noise_key
+        limit = self._max_noise_key
         if ((keys < 0) | (keys >= limit) | (keys % 1 != 0)).any():
             raise ValueError(f"keys: must be whole numbers from 0 to {limit - 1}")
         self._keys.assign(np.asarray(keys, dtype=np.float64))

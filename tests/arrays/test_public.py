@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from codrl_mj import arrays
-from codrl_mj.actuators import Drive, Inputs, Lag, TorqueSpeed, parameters_type
-from codrl_mj.arrays import advance, c_function
+from codrl_mj.actuators import DCMotorActuator, Drive, Inputs, Lag, TorqueSpeed, parameters_type
+from codrl_mj.arrays import advance, c_function, c_program
 from tests.arrays.runs import COMPILER, UNUSED, compile_c
 
 PROGRAM = """
@@ -93,6 +93,25 @@ def test_the_text_of_an_actuator_has_its_values_and_its_arm():
     assert "2.5" in text
     assert "parameters" not in text
     assert "with arm = 0.05. */" in c_function(Drive().replaced({"motor.gear_ratio": 20.0}))
+
+
+def test_a_program_of_floats_computes_with_floats_only():
+    for family in (Drive, DCMotorActuator, Lag):
+        text = "\n".join(c_program(family, portable=True, real="float").statements)
+        assert "double" not in text
+        assert "const float v" in text
+        assert not re.findall(r"(?<![\w.])\d+\.\d+(?:e[-+]?\d+)?(?![\w.])", text)
+        assert not re.findall(r"\b(?:exp|log|sqrt|fabs|fmod|cos)\(", text)
+    with pytest.raises(ValueError, match="real = 'half': must be 'double' or 'float'"):
+        c_program(Lag, real="half")
+
+
+def test_some_parameters_of_an_actuator_may_stay_variables():
+    lag = Lag(time_constant=0.123, gain=0.75)
+    text = "\n".join(c_program(lag, variables=["gain"]).statements)
+    assert "p_gain" in text
+    assert "0.123" in text
+    assert "p_time_constant" not in text
 
 
 @pytest.mark.skipif(COMPILER is None, reason="NOT RUN: no C compiler: apt-get install gcc")

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.arrays.models import prepare_model
 from tests.arrays.gearbox import Gearbox
 from tests.arrays.models import (
@@ -240,6 +241,17 @@ def test_signals_and_parameters_are_views():
         simulation.motors.parameter("motor.inductance")
 
 
+def test_the_noise_of_a_sensor_differs_between_worlds():
+    noisy = DCMotorActuator().replaced({"controller.current_noise": 0.1})
+    currents = [
+        Simulation(pendulum(), {"motor": noisy}, 2, seed=seed).move(np.ones((5, 2, 1)))[:, :, 0]
+        for seed in (0, 0, 1)
+    ]
+    np.testing.assert_array_equal(currents[0], currents[1])
+    assert (currents[0][-1] != currents[2][-1]).all()
+    assert currents[0][-1, 0] != currents[0][-1, 1]
+
+
 REFUSED = {
     "no actuator has such a name": {"third:time_constant": "uniform(0.1, 0.2)"},
     "unknown parameter tau": {"second:tau": "uniform(0.1, 0.2)"},
@@ -308,6 +320,7 @@ def test_motors_in_float_are_close_to_those_in_double():
 
 def test_mjx_ignores_the_armature_of_an_actuator():
     """The pages say so; when this changes, they can be shortened."""
+    jax = pytest.importorskip("jax", reason="NOT RUN: JAX is not installed: make simulators")
     mjx = pytest.importorskip("mujoco.mjx", reason="NOT RUN: no MJX: make simulators")
     spec = pendulum()
     spec.actuators[0].armature = 1.0
@@ -315,5 +328,9 @@ def test_mjx_ignores_the_armature_of_an_actuator():
     ours = mujoco.MjData(compiled)
     mujoco.mj_forward(compiled, ours)
     model = mjx.put_model(compiled)
-    data = mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, mjx.make_data(model))))
-    assert ours.M[0] > 1.0 > 0.1 > float(mjx.full_m(model, data)[0, 0])
+
+    @jax.jit
+    def inertia_matrix(data):
+        return mjx.full_m(model, mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, data))))
+
+    assert ours.M[0] > 1.0 > 0.1 > float(inertia_matrix(mjx.make_data(model))[0, 0])
