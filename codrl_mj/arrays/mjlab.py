@@ -178,7 +178,10 @@ class MotorActuator(Actuator[MotorActuatorCfg]):
         """Bring the motors of some environments to rest; None: of all."""
         super().reset(env_ids)
         if hasattr(self, "motors"):
-            self.motors.reset(env_ids)
+            # A mask on the device, because indices would have to be copied to the host.
+            mask = torch.zeros(self.motors.num_worlds, dtype=torch.bool, device=self._force.device)
+            mask[slice(None) if env_ids is None else env_ids] = True
+            self.motors.reset(wp.from_torch(mask))
 
     def signal(self, name: str) -> Tensor:
         """Return a tensor that views a signal of the last step, shape (environments, joints)."""

@@ -56,7 +56,7 @@ class WarpActuators:
     """Actuators of one family in many worlds: parameters, states and signals on a device.
 
     The state of a world follows the simulator's time. A call at the same time repeats the step, a
-    call one step later goes on, and a call at an earlier time begins at rest.
+    call one step later goes on, and a call at any other time begins at rest, as after a reset.
     """
 
     def __init__(
@@ -264,6 +264,8 @@ def host_indices(worlds: object) -> Any:
     """Return indices, a slice or a mask of worlds as numpy takes them."""
     if isinstance(worlds, slice):
         return worlds
+    if isinstance(worlds, wp.array):
+        return worlds.numpy()
     # A tensor of torch on a CUDA device has to be copied first.
     to_host = getattr(worlds, "cpu", None)
     return np.asarray(to_host() if to_host else worlds)
