@@ -81,8 +81,7 @@ def test_torques_of_random_actuators_in_float_are_accurate(name):
     )
     # A servo's command is a difference of positions of up to 300 rad, which a 32-bit float rounds.
     assert p999 < (5e-5 if name == "servo" else 3e-5)
-    # A flag may differ only where a limit is met within the rounding of a float.
-    assert flips <= 2
+    assert flips == 0
 
 
 def test_constants_of_a_kernel_change_nothing():
