@@ -6,12 +6,17 @@
 
 Importing the package registers its environments; since version 1.0, Gymnasium does not import it by
 itself. Every public name is imported on first use, so that `import codrl_mj` is fast.
+
+Where a package is missing that simulation needs, as beside a simulator that pins an older MuJoCo,
+nothing is registered. `codrl_mj.actuators`, `.catalogue` and `.arrays` work all the same.
 """
 
 import importlib
 import os
 import signal
 import sys
+
+from codrl_mj.requirements import missing_module_message, refuse_simulation, simulation_problem
 
 __version__ = "0.1.0"
 
@@ -32,7 +37,7 @@ _PUBLIC = {
     "Task": "codrl_mj.tasks",
     "EnvSource": "codrl_mj.envs.config",
     "ExternalEnvSource": "codrl_mj.external_envs.sources",
-    "register": "codrl_mj.envs",
+    "register": "codrl_mj.envs.registration",
     "TrainConfig": "codrl_mj.training",
     "train": "codrl_mj.training",
     "load_policy": "codrl_mj.runs.policies",
@@ -69,7 +74,10 @@ def _choose_headless_backend() -> None:
 def __getattr__(name: str) -> object:
     """Import a public name on first use."""
     if name in _PUBLIC:
-        return getattr(importlib.import_module(_PUBLIC[name]), name)
+        try:
+            return getattr(importlib.import_module(_PUBLIC[name]), name)
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError(missing_module_message(error), name=error.name) from error
     raise AttributeError(f"module 'codrl_mj' has no attribute {name!r}")
 
 
@@ -80,12 +88,15 @@ def __dir__() -> list[str]:
 
 if _is_command_line():
     signal.signal(signal.SIGINT, _exit_on_interrupt)
-# This comes before the plugin's module, which imports mujoco: mujoco then reads MUJOCO_GL.
-_choose_headless_backend()
-importlib.import_module("codrl_mj.plugin").register(
-    # The module imports numba, so it is loaded when the first model with motors is compiled.
-    lambda: importlib.import_module("codrl_mj.engine.plugin")
-)
-# Importing the kinds of env sources registers them, and the tasks with Gymnasium.
-importlib.import_module("codrl_mj.envs.task_source")
-importlib.import_module("codrl_mj.external_envs.sources")
+if simulation_problem():
+    refuse_simulation()
+else:
+    # This comes before the plugin's module, which imports mujoco: mujoco then reads MUJOCO_GL.
+    _choose_headless_backend()
+    importlib.import_module("codrl_mj.plugin").register(
+        # The module imports numba, so it is loaded when the first model with motors is compiled.
+        lambda: importlib.import_module("codrl_mj.engine.plugin")
+    )
+    # Importing the kinds of env sources registers them, and the tasks with Gymnasium.
+    importlib.import_module("codrl_mj.envs.task_source")
+    importlib.import_module("codrl_mj.external_envs.sources")

@@ -4,12 +4,12 @@ from codrl_mj.disturbances import Disturbances as Disturbances
 from codrl_mj.disturbances import Joint as Joint
 from codrl_mj.engine.reading import signals as signals
 from codrl_mj.engine.specs import add_motors as add_motors
-from codrl_mj.envs import register as register
 from codrl_mj.envs.config import EnvConfig as EnvConfig
 from codrl_mj.envs.config import EnvSource as EnvSource
 from codrl_mj.envs.distributions import Choice as Choice
 from codrl_mj.envs.distributions import LogUniform as LogUniform
 from codrl_mj.envs.distributions import Uniform as Uniform
+from codrl_mj.envs.registration import register as register
 from codrl_mj.envs.sb3 import make_sb3_vec_env as make_sb3_vec_env
 from codrl_mj.evaluation import evaluate as evaluate
 from codrl_mj.external_envs.building import motors_added as motors_added

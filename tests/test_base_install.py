@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from codrl_mj.cli import VERBS, extras
+from codrl_mj import requirements
+from codrl_mj.cli import VERBS
 
 REPOSITORY = Path(__file__).parents[1]
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
@@ -178,13 +179,15 @@ def test_a_verb_that_needs_an_extra_names_it(python, command, module, extra):
     ],
 )
 def test_the_message_on_a_missing_module_names_the_extras_that_declare_it(module, brought_by):
-    distribution = extras.DISTRIBUTIONS.get(module.partition(".")[0], module.partition(".")[0])
+    distribution = requirements.DISTRIBUTIONS.get(
+        module.partition(".")[0], module.partition(".")[0]
+    )
     declaring = [
         name for name in brought_by if any(text.startswith(distribution) for text in EXTRAS[name])
     ]
     # pyproject.toml must declare the same.
     assert declaring == brought_by
-    text = extras.missing_module_message(
+    text = requirements.missing_module_message(
         ModuleNotFoundError(f"No module named {module!r}", name=module)
     )
     assert all(f"'{name}'" in text or f"[{name}]" in text for name in brought_by)
@@ -194,6 +197,6 @@ def test_the_message_on_a_missing_module_names_the_extras_that_declare_it(module
 def test_the_message_on_an_unknown_module_keeps_its_name():
     error = ModuleNotFoundError("No module named 'nothing_such'", name="nothing_such")
     assert (
-        extras.missing_module_message(error)
+        requirements.missing_module_message(error)
         == "No module named 'nothing_such': install the package that provides it"
     )

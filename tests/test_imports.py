@@ -109,7 +109,9 @@ def test_an_unknown_name_is_an_attribute_error():
         _ = codrl_mj.Actuators
 
 
-@pytest.mark.parametrize("package", ["codrl_mj", "codrl_mj.envs"])
+@pytest.mark.parametrize(
+    "package", ["codrl_mj", "codrl_mj.engine", "codrl_mj.envs", "codrl_mj.sizing"]
+)
 def test_the_stub_of_a_package_has_its_public_names(package):
     """Type checkers and editors read the names that `__init__.py` imports on first use there."""
     module = importlib.import_module(package)

@@ -35,7 +35,8 @@ ALLOWED = {
     "tasks": {"actuators", "fields", "user_code"},
     "catalogue": {"fields", "user_code"},
     "plugin": set(),
-    "__init__": {"plugin"},
+    "requirements": set(),
+    "__init__": {"plugin", "requirements"},
     "compile_cache": set(),
     "engine": {"actuators", "fields", "compile_cache", "user_code", "plugin"},
     "physics": {
@@ -239,8 +240,9 @@ ALLOWED = {
             "validation",
             "viz.view",
         ),
+        "requirements",
     },
-    "__main__": {"cli"},
+    "__main__": {"cli", "requirements"},
 }
 LIBRARIES = {
     # Package or module -> libraries that it may import besides the standard library.
@@ -261,6 +263,7 @@ LIBRARIES = {
     "plots": {"matplotlib", "numpy"},
     "viz.pages": {"jinja2", "markupsafe", "matplotlib", "numpy", "scipy"},
     "plugin": {"mujoco"},
+    "requirements": set(),
     "compile_cache": {"mujoco", "numba", "llvmlite", "numpy", "platformdirs"},
     "engine": {"mujoco", "numba", "llvmlite", "numpy"},
     "physics": {"mujoco", "numba", "numpy", "gymnasium", "pygame"},

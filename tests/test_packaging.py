@@ -146,7 +146,7 @@ def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
 
 def test_the_wheel_has_the_program_the_version_and_the_license(wheel, metadata):
     (info,) = {name.split("/")[0] for name in wheel.namelist() if ".dist-info/" in name}
-    assert "codrl-mj = codrl_mj.cli:main" in wheel.read(f"{info}/entry_points.txt").decode()
+    assert "codrl-mj = codrl_mj.__main__:main" in wheel.read(f"{info}/entry_points.txt").decode()
     version = (
         (REPOSITORY / "codrl_mj" / "__init__.py")
         .read_text()

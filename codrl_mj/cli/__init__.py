@@ -18,13 +18,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn, Protocol, cast
 
-import gymnasium
-import mujoco
-
 import codrl_mj
 from codrl_mj.boundary import Json
-from codrl_mj.cli.extras import missing_module_message
 from codrl_mj.cli.parsing import Output, normalize_arguments, parse
+from codrl_mj.requirements import (
+    MissingPackageError,
+    missing_module_message,
+    simulation_problem,
+)
 from codrl_mj.runs.files import check_file, check_page, check_writable
 from codrl_mj.user_code import FILES_TRUSTED
 
@@ -260,9 +261,10 @@ def _format_error(error: BaseException) -> str:
         return missing_module_message(error)
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
-    if isinstance(
-        error, ValueError | OSError | RuntimeError | ArithmeticError | gymnasium.error.Error
-    ):
+    # Verbs that need no simulation also work where Gymnasium is not installed.
+    is_from_gymnasium = any(kind.__module__ == "gymnasium.error" for kind in type(error).__mro__)
+    known = ValueError | OSError | RuntimeError | ArithmeticError | MissingPackageError
+    if is_from_gymnasium or isinstance(error, known):
         return text
     return f"{type(error).__name__}: {textwrap.shorten(text, 300)} (--traceback shows where)"
 
@@ -283,6 +285,11 @@ def _engine_warnings() -> Iterator[None]:
             # digit identifies the kind.
             seen_kinds.add(re.split(r"\d", text)[0])
             _show_warning(f"MuJoCo: {text}")
+
+    if simulation_problem():
+        yield
+        return
+    import mujoco
 
     if mujoco.get_mju_user_warning() is None:
         mujoco.set_mju_user_warning(show)

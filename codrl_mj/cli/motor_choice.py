@@ -15,8 +15,8 @@ from codrl_mj.cli.parsing import AsJson, Output, Trust
 from codrl_mj.cli.terminal import print_table, print_text
 from codrl_mj.runs import unique_names
 from codrl_mj.sizing.choice import Candidate
-from codrl_mj.sizing.demand import Demand
 from codrl_mj.sizing.feasibility import OperatingPoints
+from codrl_mj.sizing.joint_demand import Demand
 
 TaskOrRun = Annotated[
     tyro.conf.Positional[str],

@@ -11,7 +11,6 @@ from gymnasium.vector import AutoresetMode
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.boundary import Argument, Info, Options
-from codrl_mj.envs import register
 from codrl_mj.envs.config import (
     COMMON_FIELDS,
     SOURCE_KINDS,
@@ -25,6 +24,7 @@ from codrl_mj.envs.config import (
     options_mapping,
 )
 from codrl_mj.envs.patterns import pattern_mapping
+from codrl_mj.envs.registration import register
 from codrl_mj.fields import check_pattern, did_you_mean
 from codrl_mj.tasks import TASKS, Task, find_task, reference_of, resolve_actuators
 from codrl_mj.user_code import asset_path

@@ -1,103 +1,68 @@
 """Sizing of drives: limits, current loops, demands of tasks and choice of a motor."""
 
-from codrl_mj.sizing.choice import (
-    Candidate,
-    actuators_of,
-    choose,
-    equivalent_gears,
-    ignored_quantities,
-    with_best_gear,
-)
-from codrl_mj.sizing.demand import Demand, demand_from_arrays, demand_of, demands_of
-from codrl_mj.sizing.feasibility import (
-    DEPENDS,
-    HOPELESS,
-    SURELY,
-    SURELY_NOT,
-    TRY_IT,
-    Bound,
-    Feasibility,
-    OperatingPoints,
-    best_ratio,
-    feasibility,
-    operating_points,
-)
-from codrl_mj.sizing.limits import (
-    DriveLimits,
-    catalogue_rows,
-    describe_motor,
-    describe_unknown,
-    drive_limits,
-    find_drive,
-    find_entry,
-    find_loop,
-    torque_limits,
-)
-from codrl_mj.sizing.loop import (
-    CurrentLoopActuator,
-    LoopAnalysis,
-    Response,
-    StepResponses,
-    analyze_loop,
-    analyze_sample_rates,
-    closed_loop,
-    is_closed,
-    loop_gains,
-    open_loop,
-    simulate_loop,
-    small_step_response,
-    step_responses,
-    undersampling_warning,
-)
-from codrl_mj.sizing.swing import Swing, min_energy_gain, min_pumped_energy, min_supply_voltage
+import importlib
 
-__all__ = [
-    "find_drive",
-    "find_entry",
-    "find_loop",
-    "DriveLimits",
-    "drive_limits",
-    "torque_limits",
-    "catalogue_rows",
-    "describe_motor",
-    "describe_unknown",
-    "CurrentLoopActuator",
-    "is_closed",
-    "loop_gains",
-    "LoopAnalysis",
-    "analyze_loop",
-    "analyze_sample_rates",
-    "undersampling_warning",
-    "open_loop",
-    "closed_loop",
-    "Response",
-    "simulate_loop",
-    "small_step_response",
-    "StepResponses",
-    "step_responses",
-    "Demand",
-    "demand_of",
-    "demands_of",
-    "demand_from_arrays",
-    "OperatingPoints",
-    "operating_points",
-    "best_ratio",
-    "Bound",
-    "Feasibility",
-    "feasibility",
-    "SURELY",
-    "DEPENDS",
-    "SURELY_NOT",
-    "HOPELESS",
-    "TRY_IT",
-    "Candidate",
-    "choose",
-    "with_best_gear",
-    "equivalent_gears",
-    "ignored_quantities",
-    "actuators_of",
-    "Swing",
-    "min_energy_gain",
-    "min_pumped_energy",
-    "min_supply_voltage",
-]
+# This function has the name of its module, whose first import would replace a name that is looked
+# up on first use.
+from codrl_mj.sizing.feasibility import feasibility as feasibility
+
+_PUBLIC = {
+    "find_drive": "codrl_mj.sizing.limits",
+    "find_entry": "codrl_mj.sizing.limits",
+    "find_loop": "codrl_mj.sizing.limits",
+    "DriveLimits": "codrl_mj.sizing.limits",
+    "drive_limits": "codrl_mj.sizing.limits",
+    "torque_limits": "codrl_mj.sizing.limits",
+    "catalogue_rows": "codrl_mj.sizing.limits",
+    "describe_motor": "codrl_mj.sizing.limits",
+    "describe_unknown": "codrl_mj.sizing.limits",
+    "CurrentLoopActuator": "codrl_mj.sizing.loop",
+    "is_closed": "codrl_mj.sizing.loop",
+    "loop_gains": "codrl_mj.sizing.loop",
+    "LoopAnalysis": "codrl_mj.sizing.loop",
+    "analyze_loop": "codrl_mj.sizing.loop",
+    "analyze_sample_rates": "codrl_mj.sizing.loop",
+    "undersampling_warning": "codrl_mj.sizing.loop",
+    "open_loop": "codrl_mj.sizing.loop",
+    "closed_loop": "codrl_mj.sizing.loop",
+    "Response": "codrl_mj.sizing.loop",
+    "simulate_loop": "codrl_mj.sizing.loop",
+    "small_step_response": "codrl_mj.sizing.loop",
+    "StepResponses": "codrl_mj.sizing.loop",
+    "step_responses": "codrl_mj.sizing.loop",
+    "Demand": "codrl_mj.sizing.joint_demand",
+    "demand_of": "codrl_mj.sizing.demand",
+    "demands_of": "codrl_mj.sizing.demand",
+    "demand_from_arrays": "codrl_mj.sizing.joint_demand",
+    "OperatingPoints": "codrl_mj.sizing.feasibility",
+    "operating_points": "codrl_mj.sizing.feasibility",
+    "best_ratio": "codrl_mj.sizing.feasibility",
+    "Bound": "codrl_mj.sizing.feasibility",
+    "Feasibility": "codrl_mj.sizing.feasibility",
+    "feasibility": "codrl_mj.sizing.feasibility",
+    "SURELY": "codrl_mj.sizing.feasibility",
+    "DEPENDS": "codrl_mj.sizing.feasibility",
+    "SURELY_NOT": "codrl_mj.sizing.feasibility",
+    "HOPELESS": "codrl_mj.sizing.feasibility",
+    "TRY_IT": "codrl_mj.sizing.feasibility",
+    "Candidate": "codrl_mj.sizing.choice",
+    "choose": "codrl_mj.sizing.choice",
+    "with_best_gear": "codrl_mj.sizing.choice",
+    "equivalent_gears": "codrl_mj.sizing.choice",
+    "ignored_quantities": "codrl_mj.sizing.choice",
+    "actuators_of": "codrl_mj.sizing.choice",
+    "Swing": "codrl_mj.sizing.swing",
+    "min_energy_gain": "codrl_mj.sizing.swing",
+    "min_pumped_energy": "codrl_mj.sizing.swing",
+    "min_supply_voltage": "codrl_mj.sizing.swing",
+}
+"""Public names -> their modules, which are imported on first use: some need an environment."""
+
+__all__ = [*_PUBLIC]
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name on first use."""
+    if name in _PUBLIC:
+        return getattr(importlib.import_module(_PUBLIC[name]), name)
+    raise AttributeError(f"module 'codrl_mj.sizing' has no attribute {name!r}")

@@ -10,7 +10,6 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorSetting, Drive, named_mapping, set_display_name
 from codrl_mj.catalogue import MotorEntry, motor_names
-from codrl_mj.sizing.demand import Demand
 from codrl_mj.sizing.feasibility import (
     MAX_FRICTION_SHARE,
     MAX_ROTOR_SHARE,
@@ -23,6 +22,7 @@ from codrl_mj.sizing.feasibility import (
     margin,
     operating_points,
 )
+from codrl_mj.sizing.joint_demand import Demand
 from codrl_mj.sizing.limits import find_drive, find_entry, max_power
 
 MARGIN = 0.2

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import Drive, GearMotor
-from codrl_mj.sizing.demand import Demand
+from codrl_mj.sizing.joint_demand import Demand
 from codrl_mj.sizing.limits import Number, max_power
 from codrl_mj.sizing.swing import Swing, min_energy_gain, min_pumped_energy, min_supply_voltage
 
