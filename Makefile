@@ -14,7 +14,7 @@ SIMULATOR_PACKAGES := warp-lang==1.19.0 mujoco-warp==4.0.0 mujoco-mjx==3.17.0 ja
 	opt_einsum==3.4.0 mjlab==1.6.0 mediapy==1.2.7 prettytable==3.18.0
 INSTALL = $(BIN)/pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: install demo test check mujoco4 simulators browser lint bench soak results docs pictures clean
+.PHONY: install demo test check mujoco4 simulators browser lint bench soak results docs pictures wheels clean
 
 install: $(STAMP)
 
@@ -108,6 +108,10 @@ docs: $(DOCS)  ## the site in build/site, and the pages that are generated from 
 
 pictures: $(STAMP)  ## for README, gallery and pages: takes half an hour, and needs Chromium
 	@$(BIN)/python scripts/pictures.py
+
+wheels: $(STAMP)  ## codrl-mj-core and codrl-mj in dist/, as a release needs them: docs/install.md
+	@$(BIN)/python -m build --no-isolation --wheel --outdir dist wheels/core
+	@$(BIN)/python -m build --no-isolation --wheel --outdir dist wheels/full
 
 clean:  ## remove everything except trained runs
 	rm -rf .venv $(MUJOCO4) $(SIMULATORS) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist

@@ -1,20 +1,15 @@
 """All that the README offers without extras works with only the core dependencies."""
 
-import importlib.metadata
 import json
-import os
 import re
-import subprocess
-import sysconfig
 import tomllib
-import venv
 from pathlib import Path
 
 import pytest
-from packaging.requirements import Requirement
 
 from codrl_mj import requirements
 from codrl_mj.cli import VERBS
+from tests.bare_environment import BareEnvironment
 
 REPOSITORY = Path(__file__).parents[1]
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
@@ -53,50 +48,13 @@ COMMANDS = [
 """Commands that neither train nor draw."""
 
 
-def _core_distributions():
-    """Return the names of all core dependencies, from the metadata of installed packages."""
-    waiting, names = [Requirement(text) for text in PROJECT["dependencies"]], set()
-    while waiting:
-        requirement = waiting.pop()
-        name = re.sub(r"[-_.]+", "-", requirement.name).lower()
-        extras_environments = [{"extra": extra} for extra in ("", *requirement.extras)]
-        if name in names or (requirement.marker and not requirement.marker.evaluate({"extra": ""})):
-            continue
-        names.add(name)
-        for text in importlib.metadata.requires(name) or []:
-            needed = Requirement(text)
-            if needed.marker is None or any(
-                needed.marker.evaluate(extra) for extra in extras_environments
-            ):
-                needed.marker = None
-                waiting.append(needed)
-    return names
-
-
 @pytest.fixture(scope="module")
 def python(tmp_path_factory):
     """Return a function that runs Python in an environment with only the core dependencies."""
-    folder = tmp_path_factory.mktemp("core")
-    venv.create(folder, symlinks=True)
-    library = Path(
-        sysconfig.get_path("purelib", "venv", {"base": str(folder), "platbase": str(folder)})
-    )
-    for name in [*_core_distributions(), "codrl-mj"]:
-        distribution = importlib.metadata.distribution(name)
-        for entry in {file.parts[0] for file in distribution.files} - {"..", "__pycache__"}:
-            source = Path(distribution.locate_file(entry)).resolve()
-            if not (library / entry).exists() and not entry.endswith(".pth"):
-                (library / entry).symlink_to(source)
-    (library / "repository.pth").write_text(str(REPOSITORY))
-    clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-
-    def run(*arguments):
-        command = [folder / "bin" / "python", *arguments]
-        return subprocess.run(
-            command, cwd=folder, env=clean, capture_output=True, text=True, timeout=300, check=False
-        )
-
-    return run
+    environment = BareEnvironment(tmp_path_factory.mktemp("core"))
+    environment.link([*PROJECT["dependencies"], "codrl-mj"])
+    environment.add_path(REPOSITORY)
+    return environment.run
 
 
 def test_environments_work_with_the_core_dependencies_alone(python):
