@@ -23,8 +23,9 @@ CORE_PACKAGES = {
     *("__main__", "actuators", "arrays", "boundary", "catalogue", "cli", "disturbances", "fields"),
     *("plots", "requirements", "user_code"),
 }
-"""Packages and modules that need only what codrl-mj-core requires, or MuJoCo of any version."""
+"""Packages and modules that need only what codrl-mj-core requires, or their simulator."""
 CORE_MODULES = {
+    *("engine", "engine.joint_dynamics", "engine.matching", "engine.shafts"),
     *("envs", "envs.distributions", "envs.patterns", "runs", "runs.files"),
     *("sizing", "sizing.choice", "sizing.feasibility", "sizing.joint_demand", "sizing.limits"),
     *("sizing.loop", "sizing.swing"),

@@ -6,10 +6,12 @@ It prints, as JSON, the folder of the package, the missing package and the modul
 import ctypes
 import importlib
 import json
+import os
 import pkgutil
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +30,16 @@ SLOW_MOTOR = """
 from codrl_mj.actuators import Lag
 SLOW = Lag(time_constant=0.2)
 """
+PENDULUM = """
+<mujoco>
+  <worldbody>
+    <body><joint name="hinge"/><geom type="sphere" size="0.1" pos="0 0 -0.5"/></body>
+  </worldbody>
+  <actuator><motor joint="hinge"/></actuator>
+</mujoco>
+"""
+SIMULATORS = {"mujoco", "mujoco_warp", "warp", "mjlab", "torch", "jax"}
+"""Modules that adapters to simulators import, beyond what the core requires."""
 MAIN = """
 int main_(double *torque) {
     struct motor_state before = {0}, after;
@@ -83,6 +95,15 @@ def use_back_ends():
         assert torque.value == expected
 
 
+def use_a_model():
+    """Match motors with a model, where MuJoCo is installed."""
+    mujoco = importlib.import_module("mujoco")
+    prepare_model = importlib.import_module("codrl_mj.arrays").prepare_model
+    spec = mujoco.MjSpec.from_string(PENDULUM)
+    robot = prepare_model(spec, {".*": {"name": MOTOR, "motor": {"gear_ratio": 20.0}}})
+    assert robot.spec.joint("hinge").armature == robot.motors[0].actuator.additions.armature > 0.0
+
+
 def refused_modules():
     """Return the modules that cannot be imported here; each error has to name the remedy."""
     refused = []
@@ -94,11 +115,17 @@ def refused_modules():
             if not str(error).endswith(simulation_problem()):
                 raise
             refused.append(name)
+        except ModuleNotFoundError as error:
+            if error.name not in SIMULATORS:
+                raise
     return refused
 
 
+os.chdir(tempfile.mkdtemp())
 use_names_and_files()
 use_back_ends()
+if "mujoco" in {module.name for module in pkgutil.iter_modules()}:
+    use_a_model()
 assert main(["motor", "list"]) == 0
 assert main(["motor", "write", MOTOR, "--as", "c", "--out", "written.c"]) == 0
 assert main(["train", "pendulum"]) == 2

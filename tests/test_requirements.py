@@ -23,7 +23,7 @@ import codrl_mj
 from codrl_mj.actuators import resolve
 motor = resolve("maxon-ec45-flat-50w", None, "a robot")
 errors = []
-for use in (lambda: codrl_mj.make, lambda: __import__("codrl_mj.engine")):
+for use in (lambda: codrl_mj.make, lambda: __import__("codrl_mj.engine.control")):
     try:
         use()
     except ImportError as error:
@@ -87,7 +87,7 @@ def test_without_numba_nothing_is_registered_and_the_environment_is_not_changed(
         "loaded": [],
         "errors": [
             f"codrl_mj.{module} cannot be imported: numba is not installed. {remedy}"
-            for module in ("factory", "engine")
+            for module in ("factory", "engine.control")
         ],
         "backend": None,
     }

@@ -129,8 +129,9 @@ def test_without_its_extra_the_command_names_the_extra(core):
     )
 
 
-def test_the_core_offers_motors_and_back_ends_and_refuses_the_rest_with_the_remedy(core):
-    core.link(["rich", "tyro"])
+@pytest.mark.parametrize("packages", [["rich", "tyro"], ["rich", "tyro", "mujoco"]])
+def test_the_core_offers_motors_and_back_ends_and_refuses_the_rest_with_the_remedy(core, packages):
+    core.link(packages)
     shutil.copy(REPOSITORY / "tests" / "core_use.py", core.folder / "use.py")
     process = core.run("use.py")
     assert process.returncode == 0, process.stdout + process.stderr
@@ -139,7 +140,8 @@ def test_the_core_offers_motors_and_back_ends_and_refuses_the_rest_with_the_reme
     assert "numba is not installed" in answer["message"]
     assert answer["message"].endswith("pip install codrl-mj")
     refused = {name.removeprefix("codrl_mj.") for name in answer["refused"]}
-    assert {"engine", "envs.config", "factory", "training"} <= refused
+    assert {"engine.plugin", "envs.config", "factory", "training"} <= refused
+    assert not {"arrays.models", "engine.matching"} & refused
     offered = requirements.CORE_PACKAGES | requirements.CORE_MODULES
     modules = pkgutil.walk_packages(codrl_mj.__path__, "codrl_mj.")
     assert offered <= {module.name.removeprefix("codrl_mj.") for module in modules} - refused
