@@ -23,22 +23,31 @@ class BareEnvironment:
         self.library = Path(sysconfig.get_path("purelib", "venv", paths))
 
     def link(self, requirements):
-        """Link the distributions that requirements need, as they are installed here."""
-        for name in needed_distributions(requirements):
+        """Link the distributions that requirements need, as they are installed here.
+
+        Returns:
+            Name -> version of these distributions.
+        """
+        # The setuptools of an environment may be older than a package requires.
+        names = needed_distributions(requirements) - {"setuptools"}
+        for name in names:
             distribution = importlib.metadata.distribution(name)
             for entry in {file.parts[0] for file in distribution.files} - {"..", "__pycache__"}:
                 source = Path(distribution.locate_file(entry)).resolve()
                 if not (self.library / entry).exists() and not entry.endswith(".pth"):
                     (self.library / entry).symlink_to(source)
+        return {name: importlib.metadata.version(name) for name in names}
 
     def add_path(self, folder):
         """Let the environment import from a folder."""
         (self.library / "more.pth").write_text(str(folder))
 
-    def install(self, wheel):
-        """Install a wheel without its dependencies."""
-        pip = [sys.executable, "-m", "pip", "--python", self.folder / "bin/python", "install"]
-        subprocess.run([*pip, "--quiet", "--no-index", "--no-deps", wheel], check=True, timeout=240)
+    def pip(self, *arguments):
+        """Run pip for the environment, and return the finished process."""
+        pip = [sys.executable, "-m", "pip", "--python", self.folder / "bin" / "python"]
+        return subprocess.run(
+            [*pip, *arguments], capture_output=True, text=True, timeout=1200, check=False
+        )
 
     def run(self, *arguments, program="python"):
         """Run a program of the environment in its folder, and return the finished process."""

@@ -27,8 +27,8 @@ def register(task: Task) -> Task:
     if task.env_id not in registry:
         register_with_gymnasium(
             id=task.env_id,
-            entry_point="codrl_mj.envs:ActuatedEnv",
-            vector_entry_point="codrl_mj.envs:ActuatedVectorEnv",
+            entry_point=f"{__package__}:ActuatedEnv",
+            vector_entry_point=f"{__package__}:ActuatedVectorEnv",
             kwargs={"task": reference_of(task)},
             max_episode_steps=task.max_episode_steps,
             reward_threshold=task.reward_threshold,
