@@ -75,6 +75,7 @@ $(SIMULATORS)/.installed: pyproject.toml constraints.txt Makefile
 simulators: $(SIMULATORS)/.installed  ## motors in mujoco_warp, MJX and mjlab, and actuators as Warp and JAX code
 	@$(SIMULATORS)/bin/python -m pytest -m "not slow and not matrix and not browser" -n 2 --dist loadfile --no-loadscope-reorder \
 		tests/simulators tests/arrays
+	@$(SIMULATORS)/bin/python -m pytest -rs -m slow -n 0 tests/simulators/test_core_wheel.py
 
 node_modules/axe-core:
 	@npm install --no-save --silent axe-core@4.14.1

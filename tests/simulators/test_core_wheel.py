@@ -6,9 +6,13 @@ import shutil
 import time
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
 
+from tests.arrays.models import STEPS, our_motion, square_waves, with_our_motors
 from tests.bare_environment import BareEnvironment
+from tests.simulators.rod import ROD
 
 REPOSITORY = Path(__file__).parents[2]
 MJLAB = "mjlab==1.6.0"
@@ -19,6 +23,18 @@ import importlib.metadata, json
 names = ("mujoco", "mujoco-warp", "warp-lang", "torch", "mjlab", "codrl-mj-core")
 print(json.dumps({name: importlib.metadata.version(name) for name in names}))
 """
+PENDULUMS = """
+import json, sys
+import numpy as np
+from tests.simulators.rods import Pendulums
+commands = np.load("commands.npy")
+np.save("angles.npy", Pendulums(commands.shape[1], motor=json.loads(sys.argv[1])).push(commands))
+"""
+MOTOR = {
+    "name": "maxon-ec45-flat-50w",
+    "motor": {"gear_ratio": 20.0, "gear_efficiency": 0.85},
+    "controller": {"max_current": 6.0},
+}
 OLD_MUJOCO = """
 import codrl_mj
 try:
@@ -74,6 +90,25 @@ def test_motors_and_back_ends_work_there(environment):
     answer = json.loads(process.stdout.splitlines()[-1])
     assert Path(answer["file"]).is_relative_to(environment.folder)
     assert answer["message"].endswith("pip install codrl-mj")
+
+
+def test_a_motor_moves_a_pendulum_of_mjlab_as_our_engine_does(environment):
+    """Run mjlab's own loop there, and our engine on its newer MuJoCo in this environment."""
+    commands = square_waves(STEPS, 4)
+    np.save(environment.folder / "commands.npy", commands)
+    (environment.folder / "tests" / "simulators").mkdir(parents=True)
+    for name in ("rod.py", "rods.py"):
+        shutil.copy(REPOSITORY / "tests/simulators" / name, environment.folder / "tests/simulators")
+    process = environment.run("-c", PENDULUMS, json.dumps(MOTOR))
+    assert process.returncode == 0, process.stdout + process.stderr
+    angles = np.load(environment.folder / "angles.npy")
+    actuator = '<actuator><motor name="motor" joint="hinge"/></actuator>'
+    rod = ROD.format(option='<option timestep="0.002"/>', actuator=actuator)
+    model = with_our_motors(mujoco.MjSpec.from_string(rod), {"motor": MOTOR})
+    gap = np.abs(angles - our_motion([model] * 4, commands)[..., 0])
+    print("largest gap", gap.max(), "range", np.ptp(angles))
+    assert np.ptp(angles) > 1.0
+    assert gap.max() < 1e-5
 
 
 def test_numba_and_gymnasium_do_not_make_the_older_mujoco_usable(environment):
