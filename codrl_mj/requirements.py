@@ -26,7 +26,7 @@ CORE_PACKAGES = {
 """Packages and modules that need only what codrl-mj-core requires, or their simulator."""
 CORE_MODULES = {
     *("engine", "engine.joint_dynamics", "engine.matching", "engine.shafts"),
-    *("envs", "envs.distributions", "envs.patterns", "runs", "runs.files"),
+    *("envs", "envs.distributions", "envs.motor_fields", "envs.patterns", "runs", "runs.files"),
     *("sizing", "sizing.choice", "sizing.feasibility", "sizing.joint_demand", "sizing.limits"),
     *("sizing.loop", "sizing.swing"),
 }
