@@ -126,6 +126,15 @@ def test_a_verb_that_needs_an_extra_names_it(python, command, module, extra):
     assert module in process.stderr.replace("-", "_")
 
 
+def test_a_public_name_that_needs_an_extra_names_it(python):
+    process = python("-c", "import codrl_mj; codrl_mj.make_sb3_vec_env")
+    assert process.returncode == 1
+    assert process.stderr.splitlines()[-1] == (
+        "ModuleNotFoundError: stable_baselines3 is not installed. The extra 'train' installs it: pip"
+        " install 'codrl-mj[train]'"
+    )
+
+
 @pytest.mark.parametrize(
     ("module", "brought_by"),
     [
