@@ -78,15 +78,16 @@ def resistance_at(parameters: Parameters | GearMotor, temperature: float) -> flo
     )
 
 
-def rise_after(
-    resistance: float, constant: float, duration: float, rise: float, watts: float
-) -> float:
-    """Return the temperature rise [K] across a thermal resistance [K/W] after a constant loss [W].
+def approach_shares(parameters: Parameters, duration: float) -> tuple[float, float]:
+    """Return the shares in (0, 1) of the way to their final values that temperatures cover.
 
-    The rise approaches resistance*watts with a time constant [s] during a duration [s].
+    A share is 1 - exp(-duration/constant), of the winding and of the housing, for a duration [s].
     """
-    decay = math.exp(-duration / constant)
-    return rise * decay + resistance * watts * (1.0 - decay)
+    # A step is so short beside the constants that 1 - exp(...) would be off by 0.1 % in float32.
+    return (
+        -math.expm1(-duration / parameters.thermal_time_constant_winding),
+        -math.expm1(-duration / parameters.thermal_time_constant_housing),
+    )
 
 
 def rises_after(
@@ -94,23 +95,17 @@ def rises_after(
 ) -> TemperatureRises:
     """Return the temperature differences after some time [s] of a constant loss [W] in the winding.
 
-    Winding and housing are two thermal bodies in series.
+    Winding and housing are two thermal bodies in series. Each difference approaches the product of
+    thermal resistance [K/W] and loss.
     """
+    winding_share, housing_share = approach_shares(parameters, duration)
+    winding_per_watt = parameters.thermal_resistance_winding * winding_share
+    housing_per_watt = parameters.thermal_resistance_housing * housing_share
+    # The small terms are added first, because in float32 a sum with a temperature loses digits of
+    # them: over 1,000 s, this order keeps 0.01 % of the rise, and the other one 0.6 %.
     return TemperatureRises(
-        rise_after(
-            parameters.thermal_resistance_winding,
-            parameters.thermal_time_constant_winding,
-            duration,
-            heat.winding,
-            watts,
-        ),
-        rise_after(
-            parameters.thermal_resistance_housing,
-            parameters.thermal_time_constant_housing,
-            duration,
-            heat.housing,
-            watts,
-        ),
+        heat.winding + (winding_per_watt * watts - heat.winding * winding_share),
+        heat.housing + (housing_per_watt * watts - heat.housing * housing_share),
     )
 
 
@@ -121,15 +116,18 @@ def thermal_limit(
 
     While the motor is cold this exceeds the continuous current; at the limit it falls to that.
     """
-    without_loss = rises_after(parameters, duration, heat, 0.0)
-    per_watt = rises_after(parameters, duration, TemperatureRises(0.0, 0.0), 1.0)
+    winding_share, housing_share = approach_shares(parameters, duration)
     margin = (
         parameters.max_temperature
         - parameters.ambient_temperature
-        - without_loss.winding
-        - without_loss.housing
+        - (heat.winding - heat.winding * winding_share)
+        - (heat.housing - heat.housing * housing_share)
     )
-    return math.sqrt(max(margin, 0.0) / (resistance * (per_watt.winding + per_watt.housing)))
+    per_watt = (
+        parameters.thermal_resistance_winding * winding_share
+        + parameters.thermal_resistance_housing * housing_share
+    )
+    return math.sqrt(max(margin, 0.0) / (resistance * per_watt))
 
 
 def inertia_of(parameters: Parameters, inertia: float) -> float:

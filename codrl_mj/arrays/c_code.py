@@ -6,12 +6,12 @@ text uses doubles and 64-bit integers, and computes exactly what the source comp
 
 import math
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from codrl_mj.actuators import ActuatorModel, Family, Inputs, family_name, parameters_type
 from codrl_mj.arrays.family import read_advance
-from codrl_mj.arrays.scalars import Kind, Scalar, ScalarLoop
+from codrl_mj.arrays.scalars import Kind, Replacement, Scalar, ScalarLoop
 
 Real = Literal["double", "float"]
 """Type of floats in C."""
@@ -52,6 +52,8 @@ class CCode:
             digits.
         real: type of floats; with `float`, no statement computes with doubles.
     """
+
+    replacements: Mapping[Callable[..., object], Replacement] = {}
 
     def __init__(self, portable: bool = False, real: Real = "double") -> None:
         """Start with no statements."""

@@ -89,6 +89,8 @@ class Reader(Arithmetic):
         if function is range:
             return Range.of(arguments)
         if isinstance(function, FunctionType):
+            if function in self.backend.replacements:
+                return self._replace(function, arguments, keywords)
             return self._read_source(function, arguments, keywords)
         owner = getattr(function, "__self__", None)
         is_tuple = isinstance(function, type) and hasattr(function, "_fields")
@@ -100,6 +102,18 @@ class Reader(Arithmetic):
         if isinstance(function, MethodType):
             return self.read(function.__func__, (owner, *arguments), keywords)
         return self.call(function, arguments, keywords)
+
+    def _replace(
+        self,
+        function: FunctionType,
+        arguments: tuple[object, ...],
+        keywords: Mapping[str, object],
+    ) -> Scalar:
+        """Return the result of a function that the back end replaces."""
+        replacement = self.backend.replacements[function]
+        values = inspect.signature(function).bind(*arguments, **keywords).args
+        operands = map(self.operand, values, replacement.kinds)
+        return Scalar(replacement.result, replacement.function(*operands))
 
     def _read_source(
         self,

@@ -5,7 +5,7 @@ and whatever a back end uses to represent it, for example the name of a C variab
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, NoReturn, Protocol, TypeGuard, cast
 
 import numpy as np
@@ -71,8 +71,23 @@ class ScalarLoop(NamedTuple):
     """Number of iterations; None if only the condition tells."""
 
 
+class Replacement(NamedTuple):
+    """Function of a back end that computes what a function of the source computes."""
+
+    kinds: tuple[Kind, ...]
+    """Kinds of the arguments."""
+    result: Kind
+    """Kind of the result."""
+    function: Callable[..., Operand]
+    """Function from operands to an operand."""
+
+
 class ScalarBackend(Protocol):
     """Receiver of the scalar operations, branches and loops of a function."""
+
+    @property
+    def replacements(self) -> Mapping[Callable[..., object], Replacement]:
+        """Functions of the source that are replaced instead of read."""
 
     def constant(self, value: float, kind: Kind) -> Operand:
         """Return a known number."""
@@ -106,6 +121,8 @@ class ScalarBackend(Protocol):
 
 class DryRun:
     """Back end without results: the reader uses it to find out kinds and structures."""
+
+    replacements: Mapping[Callable[..., object], Replacement] = {}
 
     def constant(self, value: float, kind: Kind) -> None:
         """Return nothing."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from fractions import Fraction
 
 import mujoco
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, Inputs, SampledLoop, Supply, parameters_type
-from codrl_mj.actuators.shaft import Shaft, friction
+from codrl_mj.actuators.shaft import Shaft, TemperatureRises, friction, rises_after
 
 HOT = GearMotor(
     thermal_resistance_winding=20.0, thermal_time_constant_winding=3.0, ambient_temperature=20.0
@@ -118,6 +119,24 @@ def test_current_and_temperature_equal_those_of_mujocos_dcmotor():
         ends[timestep] = max(differences)
     assert ends[0.001] < 0.02 * reference_data.act[0]
     assert 1.5 < ends[0.002] / ends[0.001] < 2.5
+
+
+@pytest.mark.parametrize("constant", [1e-3, 3.0, 1e9])
+def test_a_temperature_rises_by_its_share_to_the_last_digits(constant):
+    motor = dataclasses.replace(
+        HOT, thermal_time_constant_winding=constant, thermal_time_constant_housing=2.0 * constant
+    )
+    parameters = parameters_type(Drive)(*Drive(motor).parameter_values)
+    # The series in exact fractions. A difference of 1 and the exponential would be off by 2e-5 at
+    # the longest constant.
+    x = -Fraction(0.002) / Fraction(constant)
+    share, other_share = (
+        float(-sum(ratio**k / math.factorial(k) for k in range(1, 40))) for ratio in (x, x / 2)
+    )
+    cold = rises_after(parameters, 0.002, TemperatureRises(0.0, 0.0), 2.0)
+    assert cold == pytest.approx((40.0 * share, 0.0), rel=1e-14)
+    warm = rises_after(parameters, 0.002, TemperatureRises(50.0, 10.0), 2.0)
+    assert warm == pytest.approx((50.0 - 10.0 * share, 10.0 - 10.0 * other_share), rel=1e-12)
 
 
 @pytest.mark.parametrize("step", [0.002, 0.02])

@@ -50,6 +50,13 @@ def run_c(actuators, folder, portable=False):
     return np.column_stack([after[:, : widths[0]], torque, signals[:, : widths[1]]])
 
 
+def rounded(actuators):
+    """Return actuators whose parameters, states and inputs are numbers of float32."""
+    tables = (actuators.parameters, actuators.state, actuators.inputs)
+    p, s, x = (values.astype(np.float32).astype(float) for values in tables)
+    return actuators._replace(parameters=p, state=s, inputs=x)
+
+
 def run_arrays(actuators, module, convert=np.array, wrap=lambda function: function):
     """Return states, torques and signals by arrays, shape (n, s + 1 + k)."""
     parameters, timestep, state, inputs = actuators.arguments(convert)

@@ -70,10 +70,32 @@ def test_results_without_dependence_on_arrays_have_the_common_shape():
     assert torque.shape == state.c1.shape == (4,)
 
 
-def test_single_precision_is_refused():
-    message = "speed has the dtype float32: expected float64; convert it"
+def test_arrays_of_integers_are_refused():
+    message = "speed has the dtype int64: expected float64 or float32; convert it"
     with pytest.raises(ValueError, match=message):
-        advance(TorqueSpeed, np, (1.0, 10.0, 1.0), 0.01, (), line_inputs(np.zeros(2, np.float32)))
+        advance(TorqueSpeed, np, (1.0, 10.0, 1.0), 0.01, (), line_inputs(np.zeros(2, np.int64)))
+
+
+def test_arrays_of_two_types_are_refused():
+    message = "speed has the dtype float32, and stall_torque has float64: expected the same for all"
+    with pytest.raises(ValueError, match=message):
+        advance(
+            TorqueSpeed,
+            np,
+            (np.ones(2), 10.0, 1.0),
+            0.01,
+            (),
+            line_inputs(np.zeros(2, np.float32)),
+        )
+
+
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [(0, "max_iterations = 0: must be >= 1"), (3, "= 3: is for jax.numpy only; leave it None for")],
+)
+def test_a_limit_of_iterations_is_for_jax(number, message):
+    with pytest.raises(ValueError, match=message):
+        advance(TorqueSpeed, np, (1.0, 10.0, 1.0), 0.01, (), line_inputs(np.zeros(2)), number)
 
 
 def test_inputs_without_arrays_are_refused():
