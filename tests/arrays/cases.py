@@ -342,19 +342,10 @@ def case(name, num):
 
 
 def for_single_precision(actuators):
-    """Return actuators whose results do not jump within the rounding of 32-bit floats.
-
-    Noise keys become whole numbers that a float holds. Inertias are 1 % greater, because many of
-    them are exactly those at which a drive computes a step in one more piece.
-    """
-    names, inputs = Inputs._fields, actuators.inputs.copy()
-    inputs[:, names.index("noise_key")] %= 2**24
-    inputs[:, names.index("inertia")] *= 1.01
-    parameters = actuators.parameters.copy()
-    fields = parameters_type(actuators.family)._fields
-    if "load_inertia" in fields:
-        parameters[:, fields.index("load_inertia")] *= 1.01
-    return actuators._replace(parameters=parameters, inputs=inputs)
+    """Return actuators whose noise keys are whole numbers that a 32-bit float holds."""
+    inputs = actuators.inputs.copy()
+    inputs[:, Inputs._fields.index("noise_key")] %= 2**24
+    return actuators._replace(inputs=inputs)
 
 
 @functools.cache
