@@ -13,6 +13,9 @@ from codrl_mj.cli.terminal import print_table, print_text
 from codrl_mj.fields import did_you_mean
 from codrl_mj.study.evidence import Evidence, LossBounds, Outcome
 
+POLICIES = 10
+"""Number of policies of each kind that `--measure` trains if none is given."""
+
 # `codrl_mj.study.advice` loads the engine, so only the running verb imports it.
 Advice = Any
 """Class of this name in `codrl_mj.study.advice`."""
@@ -29,6 +32,22 @@ _DELIVERED = {
 }
 
 
+def _count(words: list[str]) -> int:
+    if len(words) > 1:
+        raise ValueError(f"--measure {' '.join(words)}: must be one number of policies, or none")
+    return int(words[0]) if words else POLICIES
+
+
+_COUNT = tyro.constructors.PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="[INT]",
+    instance_from_str=_count,
+    is_instance=lambda value: value is None or isinstance(value, int),
+    str_from_instance=lambda value: [str(value)],
+)
+"""Parser of a number that may be left out."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Advise:
     """Recommend what to do about an actuator: train on ideal forces, tune, randomize or replace it.
@@ -40,7 +59,7 @@ class Advise:
     if you interrupt it, the same command continues.
 
     Example: codrl-mj advise maxon-ec45-flat-50w pendulum --gear-ratio 20, or codrl-mj advise paper
-    cartpole --measure 5
+    cartpole --measure 10
     """
 
     actuator: Annotated[
@@ -69,8 +88,9 @@ class Advise:
     """Turns of the rotor per turn of the joint, or radians per meter; default: the motor's own."""
     voltage: float | None = None
     """Voltage of the supply [V]; default: the motor's nominal voltage."""
-    measure: int | None = None
-    """Number of policies that are trained in each way and tested on the actuator, at least 2."""
+    measure: Annotated[int | None, _COUNT] = None
+    """Number of policies that are trained in each way and tested on the actuator, at least 2; 10 if
+    no number follows."""
     root: Path = Path("runs/advise")
     """Folder in which --measure creates its run folders."""
     jobs: int = -1
@@ -91,7 +111,7 @@ class Advise:
             raise ValueError(
                 f"TASK = {self.task!r}: {did_you_mean(self.task, REFERENCE_SPEEDS)}The study covers"
                 f" {', '.join(REFERENCE_SPEEDS)}; for other tasks and for runs, train and test with"
-                " --measure 5"
+                " --measure 10"
             )
         if self.measure is not None and self.measure < 2:
             raise ValueError(
@@ -112,6 +132,7 @@ class Advise:
                 raise ValueError(f"{flags}: {error}" if flags else str(error)) from error
             advice = advise(actuator, self.task, Evidence.read(*filter(None, [self.evidence])))
             _print_advice(self.actuator, advice)
+            self._print_training(advice.verdict)
             print_text(actuator.assumed)
         measured = None
         if self.measure is not None:
@@ -132,10 +153,38 @@ class Advise:
             )
             more = " by more policies (--measure)" * (measured["verdict"] == "measure it")
             print_text(f"measured: {measured['verdict']}{more}")
+            # Without failures, the share f is plausible while (1 - f)^n is at least 5 %.
+            bound = 1.0 - 0.05 ** (1.0 / self.measure)
+            print_text(
+                f"If none of {self.measure} policies fails, up to {bound:.0%} may fail (95 %)."
+            )
+            self._print_training(measured["verdict"])
         units = {name: unit or "1" for name, (_, unit, _) in _DELIVERED.items()} | {
             "loss": "share of the task's span"
         }
         return 0, {"units": units, "advice": advice, "measured": measured}
+
+    def _print_training(self, verdict: str | None) -> None:
+        """Print the command of a training that is recommended on a task of the study."""
+        from codrl_mj.study.advice import RANDOMIZE, THROUGH
+        from codrl_mj.study.axes import SECONDS, random_training
+
+        if verdict == RANDOMIZE and self.task in SECONDS:
+            print_text(f"train: {random_training(self.task)}")
+        elif verdict == THROUGH and self.task in SECONDS:
+            fields = {
+                "motor.gear-ratio": self.gear_ratio,
+                "supply.voltage": self.voltage,
+            }
+            flags = "".join(
+                f" --actuator.{name} {value:g}"
+                for name, value in fields.items()
+                if value is not None
+            )
+            print_text(
+                f"train: codrl-mj train {self.task} --actuator {self.actuator}{flags}"
+                " --out runs/through"
+            )
 
 
 def _print_advice(name: str, advice: Advice) -> None:
@@ -168,7 +217,7 @@ def _print_advice(name: str, advice: Advice) -> None:
     print_text(
         f"{advice.verdict}: {advice.reason}"
         if advice.verdict
-        else f"no verdict: {advice.reason} (--measure 5)"
+        else f"no verdict: {advice.reason} (--measure 10)"
     )
 
 

@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 from codrl_mj.actuators import (
     IDEAL,
@@ -21,6 +22,7 @@ from codrl_mj.actuators import (
     SampledLoop,
     Supply,
 )
+from codrl_mj.actuators.lag import HISTORY
 from codrl_mj.actuators.parameters import FieldValue
 from codrl_mj.boundary import Argument
 from codrl_mj.disturbances import Disturbances, Joint
@@ -258,26 +260,82 @@ def ideal_arm(task: str) -> Arm:
     return make_arm(task, "ideal", study_env(task))
 
 
-def generic_arm(base: Arm) -> Arm:
-    """Return the arm trained with generic randomization: of strength, lag, delay and pushes.
+class RandomRanges(NamedTuple):
+    """Ranges of random actuators, from which a lag is drawn for every episode."""
 
-    This is common practice where no model of the motor is available.
+    lag: float
+    """Largest time constant [policy steps]; the smallest is 0."""
+    weakest: float
+    """Smallest force, as a share of the commanded one."""
+    strongest: float
+    """Largest force, as a share of the commanded one."""
+    delay: float
+    """Largest delay [policy steps]; the smallest is 0."""
+
+
+RANDOM_RANGES: Mapping[str, RandomRanges] = {
+    "pendulum": RandomRanges(1.0, 0.9, 1.1, 1.0),
+    "furuta": RandomRanges(0.5, 0.8, 1.2, 0.5),
+    "acrobot": RandomRanges(2.0, 0.8, 1.2, 2.0),
+}
+"""Task -> ranges of the arm `random` of the second study (docs/results/insurance_plan.md)."""
+
+
+def generic_ranges(task: str) -> RandomRanges:
+    """Return the ranges of the arm `generic` of the first study, which exist for every task.
+
+    They are common practice where no model of the motor is available.
+    """
+    longest_delay = HISTORY * timestep(task) / find_task(task).step_duration
+    return RandomRanges(2.0, 0.5, 1.25, longest_delay)
+
+
+def random_ranges(task: str) -> RandomRanges:
+    """Return the ranges that are recommended and measured on a built-in task: the latest tested."""
+    return RANDOM_RANGES.get(task, generic_ranges(task))
+
+
+def generic_arm(base: Arm) -> Arm:
+    """Return the arm trained with generic randomization: of strength, lag, delay and pushes."""
+    return random_arm(base, generic_ranges(base.task))
+
+
+def random_arm(base: Arm, ranges: RandomRanges) -> Arm:
+    """Return the arm trained on random actuators: of random strength, lag and delay, with pushes.
 
     Args:
         base: arm of a built-in task on ideal forces; all other settings are kept.
+        ranges: ranges of the random actuators.
     """
-    env, definition = base.config.env, find_task(base.task)
-    step, pulse = definition.step_duration, 0.25 * definition.max_force
-    ranges = (
-        f"time_constant=uniform(0, {2 * step:g})",
-        f"delay=uniform(0, {8 * timestep(base.task):g})",
+    env, step = base.config.env, find_task(base.task).step_duration
+    drawn = (
+        f"time_constant=uniform(0, {ranges.lag * step:g})",
+        f"delay=uniform(0, {ranges.delay * step:g})",
+        f"gain=uniform({ranges.weakest:g}, {ranges.strongest:g})",
     )
+    pulse = 0.25 * find_task(base.task).max_force
     pushes = Disturbances(pulse_force=pulse, pulse_duration=step, pulse_interval=10 * step)
-    randomized = dataclasses.replace(
-        env, actuator=Lag(), randomize=(*ranges, "gain=uniform(0.5, 1.25)"), disturbances=pushes
-    )
+    randomized = dataclasses.replace(env, actuator=Lag(), randomize=drawn, disturbances=pushes)
+    # A lag stores the commands of a few integration steps only: long delays need long steps.
+    shortest = ranges.delay * step / HISTORY
+    if shortest > 1.001 * (env.timestep or timestep(base.task)):
+        randomized = dataclasses.replace(randomized, timestep=shortest)
     config = dataclasses.replace(base.config, env=randomized)
     return dataclasses.replace(base, name=f"{base.task}: generic", config=config)
+
+
+def random_training(task: str) -> str:
+    """Return the command that trains on random actuators, as in the studies; see `random_ranges`."""
+    config = random_arm(ideal_arm(task), random_ranges(task)).config
+    env = config.env
+    pushes = env.disturbances
+    drawn = " ".join(f'"{text}"' for text in env.randomize or ())
+    return (
+        f"codrl-mj train {task} --agent {config.agent.name} --total-steps {config.total_steps}"
+        f" --actuator lag --env.timestep {env.timestep:g} --env.randomize {drawn} --env.disturbances.pulse-force {pushes.pulse_force:g}"
+        f" --env.disturbances.pulse-duration {pushes.pulse_duration:g}"
+        f" --env.disturbances.pulse-interval {pushes.pulse_interval:g} --out runs/random"
+    )
 
 
 def ideal_trial(arm: Arm) -> Trial:

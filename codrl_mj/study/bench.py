@@ -77,6 +77,10 @@ class ActuatorResponse(NamedTuple):
     first-order lag. Ringing counts as lag. Source: Astrom, Hagglund, *PID Controllers*, 2nd ed.,
     section 2.4 (area methods).
     """
+    least_lag: float
+    """The same, but force beyond the final one makes up for late force [steps]; >= 0. A loop that
+    overshoots has an effect between the two lags.
+    """
     at_rest: float
     """Final force at standstill (blocked joint) [largest force]."""
     at_speed: float
@@ -131,11 +135,13 @@ def measure_response(
     last = float(np.mean(_end(torques)))
     started = np.flatnonzero(np.abs(torques) > 1e-3 * abs(last))
     dead = int(started[0]) if len(started) else 0
-    lag = max(float(np.sum(np.abs(1.0 - torques / last))) - dead, 0.0) if last else 0.0
+    missing = 1.0 - torques / last if last else np.zeros(1)
+    lag, least_lag = (max(float(np.sum(part)) - dead, 0.0) for part in (np.abs(missing), missing))
     settled = unasked[len(unasked) // 2 :] / force
     return ActuatorResponse(
         dead_time=dead * timestep / step,
         lag=lag * timestep / step,
+        least_lag=least_lag * timestep / step,
         at_rest=last,
         at_speed=float(np.mean(_end(delivered_torque(speed)))),
         friction=max(braking(0.05 * speed)[0], braking(speed)[1], 0.0),
@@ -230,6 +236,25 @@ def redesign_loop(actuator: ActuatorModel, task: str) -> Drive | None:
             None if loop == actuator.controller else dataclasses.replace(actuator, controller=loop)
         )
     return None
+
+
+def has_wind_up(actuator: ActuatorModel) -> bool:
+    """Return True if the integrator of a current loop continues while the voltage saturates."""
+    if isinstance(actuator, DCMotorActuator):
+        return actuator.controller.ki > 0.0
+    if not isinstance(actuator, Drive):
+        return False
+    loop = actuator.controller
+    # Without own gains, the loop is designed, with an integrator.
+    return loop.anti_windup == "none" and (loop.ki > 0.0 or loop.kp == 0.0)
+
+
+def fix_sensor(actuator: ActuatorModel) -> DCMotorActuator | None:
+    """Return the motor and loop with an exact current sensor; None if it is exact already."""
+    if not isinstance(actuator, DCMotorActuator):
+        return None
+    exact = dataclasses.replace(actuator.controller, current_noise=0.0, current_bias=0.0)
+    return None if exact == actuator.controller else dataclasses.replace(actuator, controller=exact)
 
 
 def drive_with_designed_loop(actuator: DCMotorActuator, task: str) -> Drive:

@@ -1,4 +1,4 @@
-"""Accuracy of `codrl-mj advise` on every tested actuator, without that actuator's own tests."""
+"""Accuracy of `codrl-mj advise` on all tested actuators and severities, each without its tests."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -6,10 +6,26 @@ from typing import Any
 import numpy as np
 
 from actuator_study import arms
-from codrl_mj.study.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, advise, decide
+from actuator_study.exploration import paper_loops, wound_up
+from codrl_mj.study.advice import (
+    BUY,
+    IDEAL,
+    LOOP,
+    MEASURE,
+    RANDOM,
+    RANDOMIZE,
+    SENSOR,
+    THROUGH,
+    advise,
+    decide,
+    option_bounds,
+)
 from codrl_mj.study.axes import AXES, SECONDS, study_env
 from codrl_mj.study.evidence import Evidence, LossBounds
 from codrl_mj.study.questions import MARGIN
+
+WINDING, PAPER = ", winding up", "paper, "
+"""Parts of the names of tests: of drives without anti-windup, and of variants of the paper's loop."""
 
 
 def tested(task: str) -> dict[str, tuple[str, Any]]:
@@ -20,12 +36,24 @@ def tested(task: str) -> dict[str, tuple[str, Any]]:
     called = {
         test: (motor_name(motor), study_env(task, motor).actuator) for test, motor in motors.items()
     }
-    if task not in arms.LOOPED:
-        return called
-    loops = {loop: arms.designed(task) if loop == "designed" else loop for loop in LOOPS}
+    if task in arms.LOOPED:
+        loops = {loop: arms.designed(task) if loop == "designed" else loop for loop in LOOPS}
+        called |= {
+            loop: (f"paper's motor, {loop} loop", study_env(task, loop_actuator).actuator)
+            for loop, loop_actuator in loops.items()
+        }
+        # The variants of the integration step have the same actuator.
+        called |= {
+            f"{PAPER}{variant}": (f"paper's motor, {variant}", env.actuator)
+            for variant, env in paper_loops(task).items()
+            if "step" not in variant
+        }
     return called | {
-        loop: (f"paper's motor, {loop} loop", study_env(task, loop_actuator).actuator)
-        for loop, loop_actuator in loops.items()
+        f"supply {severity:g}{WINDING}": (
+            f"{100 * severity:.0f} % of the voltage missing, no anti-windup",
+            wound_up(task, severity).actuator,
+        )
+        for severity in AXES["supply"].severities[1:]
     }
 
 
@@ -39,13 +67,39 @@ def motor_name(motor: Mapping[str, Any]) -> str:
     return f"{motor['name']}, {motor['motor']['gear_ratio']:g}:1{volts}"
 
 
+def left_out_tests(test: str) -> tuple[str, ...]:
+    """Return the tests that advice on an actuator must predict: its own, and near copies."""
+    return (test, *LOOPS) if test.startswith(PAPER) else (test,)
+
+
 def measured(evidence: Evidence, task: str, test: str) -> dict[str, LossBounds]:
     """Return the measured loss of policies on an actuator, by training option."""
     trained = {IDEAL: ("ideal", test), THROUGH: (test, test)}
-    if test in ("weaker", "paper"):
+    if test in ("weaker", "paper") or test.startswith(PAPER):
         trained[LOOP] = ("ideal", "designed")
+    elif test.endswith(WINDING):
+        trained[LOOP] = ("ideal", test.removesuffix(WINDING))
+    return _bounds(evidence, task, trained, "ideal")
+
+
+def measured_at(evidence: Evidence, task: str, axis: str, severity: float) -> dict[str, LossBounds]:
+    """Return the measured loss of policies at a severity of one axis, by training option."""
+    test = f"{axis} {severity:g}"
+    without = f"{axis} 0" if AXES[axis].motor_at_zero else "ideal"
+    trained = {IDEAL: ("ideal", test), RANDOMIZE: (RANDOM, test)}
+    if axis == "noise":
+        trained[SENSOR] = ("ideal", without)
+    if AXES[axis].training_severity.get(task) == severity:
+        trained[THROUGH] = (axis, test)
+    return _bounds(evidence, task, trained, without)
+
+
+def _bounds(
+    evidence: Evidence, task: str, trained: Mapping[str, tuple[str, str]], reference: str
+) -> dict[str, LossBounds]:
+    """Return the measured losses of options, given as (arm, test)."""
     outcomes = {
-        name: evidence.outcome(task, arm, deployed, "ideal" if arm == "ideal" else None)
+        name: evidence.outcome(task, arm, deployed, reference if arm == "ideal" else None)
         for name, (arm, deployed) in trained.items()
     }
     return {
@@ -56,7 +110,11 @@ def measured(evidence: Evidence, task: str, test: str) -> dict[str, LossBounds]:
 
 
 def judged(verdict: str, options: Mapping[str, LossBounds]) -> str:
-    """Judge a verdict: right if its option loses nothing, or surely less than doing nothing."""
+    """Judge a verdict by the measured losses and the rule of `decide`.
+
+    It is right if its option is what the rule recommends of it and of doing nothing: a remedy
+    where nothing is lost is wrong.
+    """
     if verdict == MEASURE:
         return "says nothing"
     if verdict == BUY:
@@ -76,7 +134,7 @@ def rows(evidence: Evidence) -> Iterator[dict[str, Any]]:
         for test, (name, actuator) in tested(task).items():
             options = measured(evidence, task, test)
             # The actuator's own tests are removed, so that advice has to predict them.
-            advice = advise(actuator, task, evidence.without(test))
+            advice = advise(actuator, task, evidence.without(*left_out_tests(test)))
             if IDEAL not in options or not advice.options:
                 continue
             predicted, outcome = advice.options[IDEAL].lower, options[IDEAL].lower
@@ -98,6 +156,25 @@ def rows(evidence: Evidence) -> Iterator[dict[str, Any]]:
                 ),
                 "judged": judged(advice.verdict or MEASURE, options),
             }
+
+
+def severity_judgments(evidence: Evidence) -> Iterator[tuple[str, str]]:
+    """Yield (verdict, judgment) for each tested severity, predicted without its tests."""
+    for task in SECONDS:
+        for axis, known in AXES.items():
+            for severity in known.severities[1:]:
+                options = measured_at(evidence, task, axis, severity)
+                remaining = evidence.without(f"{axis} {severity:g}")
+                requested = dict.fromkeys(AXES, 0.0) | {axis: severity}
+                if IDEAL not in options or remaining.loss(task, axis, severity) is None:
+                    continue
+                bounds = option_bounds(remaining, task, requested)
+                # At a severity of noise, an exact sensor leaves nothing.
+                if axis == "noise":
+                    none = dict.fromkeys(AXES, 0.0)
+                    bounds[SENSOR] = option_bounds(remaining, task, none, {})[IDEAL]
+                verdict = decide(bounds)
+                yield verdict, judged(verdict, options)
 
 
 def left_out(evidence: Evidence) -> dict[str, float]:

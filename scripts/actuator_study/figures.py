@@ -17,7 +17,7 @@ from codrl_mj.study.advice import (
     THROUGH,
     decide,
     option_bounds,
-    tested_points,
+    tested_arms,
 )
 from codrl_mj.study.axes import AXES, SECONDS
 from codrl_mj.study.evidence import Evidence
@@ -200,7 +200,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
     panels: Any = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
     zero_severities, shown_regions = dict.fromkeys(AXES, 0.0), set[int]()
     for panel, task in zip(panels, tasks, strict=False):
-        points = tested_points(evidence, task)
+        tests = tested_arms(evidence, task)
         regions = np.array(
             [
                 [
@@ -210,7 +210,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
                                 evidence,
                                 task,
                                 zero_severities | {"lag": lag, "supply": shortfall},
-                                points,
+                                tests,
                             )
                         )
                     )
