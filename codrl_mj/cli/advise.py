@@ -147,18 +147,19 @@ class Advise:
             )
             compute(measurement_plan.grid, Workers(self.jobs))
             options = measurement_plan.loss_bounds(measurement_plan.grid.collect())
-            measured = {"options": options, "verdict": decide(options)}
+            verdict = decide(options)
+            measured = {"options": options, "verdict": verdict}
             _print_options(
                 f"Measured: {self.measure} policies of each kind, 50 episodes each", options
             )
-            more = " by more policies (--measure)" * (measured["verdict"] == "measure it")
-            print_text(f"measured: {measured['verdict']}{more}")
+            more = " by more policies (--measure)" * (verdict == "measure it")
+            print_text(f"measured: {verdict}{more}")
             # Without failures, the share f is plausible while (1 - f)^n is at least 5 %.
             bound = 1.0 - 0.05 ** (1.0 / self.measure)
             print_text(
                 f"If none of {self.measure} policies fails, up to {bound:.0%} may fail (95 %)."
             )
-            self._print_training(measured["verdict"])
+            self._print_training(verdict)
         units = {name: unit or "1" for name, (_, unit, _) in _DELIVERED.items()} | {
             "loss": "share of the task's span"
         }

@@ -325,14 +325,15 @@ def random_arm(base: Arm, ranges: RandomRanges) -> Arm:
 
 
 def random_training(task: str) -> str:
-    """Return the command that trains on random actuators, as in the studies; see `random_ranges`."""
+    """Return the command that trains as in the studies on the actuators of `random_ranges`."""
     config = random_arm(ideal_arm(task), random_ranges(task)).config
-    env = config.env
-    pushes = env.disturbances
+    env, pushes = config.env, config.env.disturbances
     drawn = " ".join(f'"{text}"' for text in env.randomize or ())
+    budget = "" if config.total_steps is None else f" --total-steps {config.total_steps}"
     return (
-        f"codrl-mj train {task} --agent {config.agent.name} --total-steps {config.total_steps}"
-        f" --actuator lag --env.timestep {env.timestep:g} --env.randomize {drawn} --env.disturbances.pulse-force {pushes.pulse_force:g}"
+        f"codrl-mj train {task} --agent {config.agent.name}{budget}"
+        f" --actuator lag --env.timestep {env.timestep:g} --env.randomize {drawn}"
+        f" --env.disturbances.pulse-force {pushes.pulse_force:g}"
         f" --env.disturbances.pulse-duration {pushes.pulse_duration:g}"
         f" --env.disturbances.pulse-interval {pushes.pulse_interval:g} --out runs/random"
     )

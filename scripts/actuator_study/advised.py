@@ -27,6 +27,9 @@ from codrl_mj.study.questions import MARGIN
 WINDING, PAPER = ", winding up", "paper, "
 """Parts of the names of tests: of drives without anti-windup, and of variants of the paper's loop."""
 
+KINDS = ("motors and loops", "variants of the paper's loop", "drives without anti-windup")
+"""Kinds of actuators that were tested, besides single severities."""
+
 
 def tested(task: str) -> dict[str, tuple[str, Any]]:
     """Return the label and the actuator of each test that is not a severity of a single axis."""
@@ -65,6 +68,11 @@ def motor_name(motor: Mapping[str, Any]) -> str:
     """Return a motor's name with its gear, and its supply voltage if that is not nominal."""
     volts = f", {motor['supply']['voltage']:g} V" if "supply" in motor else ""
     return f"{motor['name']}, {motor['motor']['gear_ratio']:g}:1{volts}"
+
+
+def kind(test: str) -> str:
+    """Return the kind of actuator of a test: one of `KINDS`."""
+    return KINDS[2] if test.endswith(WINDING) else KINDS[1] if test.startswith(PAPER) else KINDS[0]
 
 
 def left_out_tests(test: str) -> tuple[str, ...]:
@@ -137,21 +145,25 @@ def rows(evidence: Evidence) -> Iterator[dict[str, Any]]:
             advice = advise(actuator, task, evidence.without(*left_out_tests(test)))
             if IDEAL not in options or not advice.options:
                 continue
-            predicted, outcome = advice.options[IDEAL].lower, options[IDEAL].lower
+            bounds, outcome = advice.options[IDEAL], options[IDEAL].lower
+            predicted = bounds.upper or bounds.lower
             assert predicted is not None
             assert outcome is not None
+            decided = decide(options)
             yield {
                 "task": task,
                 "actuator": name,
-                "beyond": advice.options[IDEAL].upper is None,
+                "kind": kind(test),
+                "beyond": bounds.upper is None,
                 **{f"predicted_{key}": value for key, value in predicted.loss._asdict().items()},
                 **{f"measured_{key}": value for key, value in outcome.loss._asdict().items()},
                 "measured_failed": outcome.failed,
                 "measured_success_lost": outcome.success_lost.mean,
                 "said": advice.verdict,
+                # Where nothing was trained through it, another motor may not be needed.
                 "measured": (
-                    decide(options)
-                    if THROUGH in options or outcome.is_negligible
+                    decided
+                    if THROUGH in options or decided not in (BUY, MEASURE)
                     else "not trained through"
                 ),
                 "judged": judged(advice.verdict or MEASURE, options),
