@@ -167,11 +167,12 @@ class Advise:
 
     def _print_training(self, verdict: str | None) -> None:
         """Print the command of a training that is recommended on a task of the study."""
+        # Commands are not wrapped, so that they can be copied.
         from codrl_mj.study.advice import RANDOMIZE, THROUGH
         from codrl_mj.study.axes import SECONDS, random_training
 
         if verdict == RANDOMIZE and self.task in SECONDS:
-            print_text(f"train: {random_training(self.task)}")
+            print(random_training(self.task))
         elif verdict == THROUGH and self.task in SECONDS:
             fields = {
                 "motor.gear-ratio": self.gear_ratio,
@@ -182,9 +183,8 @@ class Advise:
                 for name, value in fields.items()
                 if value is not None
             )
-            print_text(
-                f"train: codrl-mj train {self.task} --actuator {self.actuator}{flags}"
-                " --out runs/through"
+            print(
+                f"codrl-mj train {self.task} --actuator {self.actuator}{flags} --out runs/through"
             )
 
 
@@ -200,11 +200,12 @@ def _print_advice(name: str, advice: Advice) -> None:
     if advice.losses:
         rows = []
         for loss in advice.losses:
-            unit = (
-                AXES[loss.axis].unit.rpartition("[")[2].removesuffix("]").removeprefix("missing ")
-            )
-            tested = ", ".join(severity.removeprefix(f"{loss.axis} ") for severity in loss.between)
-            cells = _loss_cells(loss.outcome, "at least " * loss.beyond)
+            # Wind-up is tested on supplies.
+            axis = loss.axis if loss.axis in AXES else "supply"
+            unit = AXES[axis].unit.rpartition("[")[2].removesuffix("]").removeprefix("missing ")
+            tested = ", ".join(test.split()[1].strip(",") for test in loss.between)
+            bound = "at most " * (loss.lower is not loss.outcome)
+            cells = _loss_cells(loss.outcome, "at least " if loss.beyond else bound)
             rows.append((loss.axis, f"{loss.severity:.3g}", unit, *cells, tested))
         label = "Losses of policies that were trained on ideal forces [shares of the task's span]"
         print_table(

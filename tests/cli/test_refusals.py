@@ -92,7 +92,7 @@ REFUSED = [
     ("render furuta --trajectory a.csv", "the suffix is '.csv', must be .npz"),
     ("replay furuta --out a.mp4", "the suffix is '.mp4', must be .html"),
     ("advise re25 Hopper-v5", "The study covers pendulum, cartpole"),
-    ("advise re25 Hopper-v5", "--measure 5"),
+    ("advise re25 Hopper-v5", "--measure 10"),
     *(
         (f"{verb} RUN {flag}{value}", f"{text}{flag}{end}")
         for verb in ("evaluate", "render")
