@@ -132,11 +132,14 @@ class Advise:
                 raise ValueError(f"{flags}: {error}" if flags else str(error)) from error
             advice = advise(actuator, self.task, Evidence.read(*filter(None, [self.evidence])))
             _print_advice(self.actuator, advice)
-            self._print_training(advice.verdict)
+            if advice.command:
+                # Commands are not wrapped, so that they can be copied.
+                print(advice.command)
             print_text(actuator.assumed)
         measured = None
         if self.measure is not None:
-            from codrl_mj.study.advice import decide, plan_measurement
+            from codrl_mj.study.advice import RANDOMIZE, decide, plan_measurement
+            from codrl_mj.study.axes import random_training
             from codrl_mj.study.parallel import Workers
             from codrl_mj.study.program import compute
 
@@ -159,33 +162,12 @@ class Advise:
             print_text(
                 f"If none of {self.measure} policies fails, up to {bound:.0%} may fail (95 %)."
             )
-            self._print_training(verdict)
+            if verdict == RANDOMIZE and is_studied:
+                print(random_training(self.task))
         units = {name: unit or "1" for name, (_, unit, _) in _DELIVERED.items()} | {
             "loss": "share of the task's span"
         }
         return 0, {"units": units, "advice": advice, "measured": measured}
-
-    def _print_training(self, verdict: str | None) -> None:
-        """Print the command of a training that is recommended on a task of the study."""
-        # Commands are not wrapped, so that they can be copied.
-        from codrl_mj.study.advice import RANDOMIZE, THROUGH
-        from codrl_mj.study.axes import SECONDS, random_training
-
-        if verdict == RANDOMIZE and self.task in SECONDS:
-            print(random_training(self.task))
-        elif verdict == THROUGH and self.task in SECONDS:
-            fields = {
-                "motor.gear-ratio": self.gear_ratio,
-                "supply.voltage": self.voltage,
-            }
-            flags = "".join(
-                f" --actuator.{name} {value:g}"
-                for name, value in fields.items()
-                if value is not None
-            )
-            print(
-                f"codrl-mj train {self.task} --actuator {self.actuator}{flags} --out runs/through"
-            )
 
 
 def _print_advice(name: str, advice: Advice) -> None:

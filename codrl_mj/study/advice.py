@@ -79,7 +79,7 @@ def decide(options: Mapping[str, LossBounds]) -> str:
        would be recommended that nothing shows to be needed.
     2. Otherwise the first of `OPTIONS` whose loss is negligible.
     3. Otherwise consider the options that are certainly better than training on ideal forces
-       (`is_better`), and return the first than which none of them is certainly better still. An
+       (`is_better`), and return the first that is not certainly worse than the best of them. An
        option with which every policy fails is not considered.
     4. Otherwise `BUY` if every option is certainly harmful.
     5. Otherwise `MEASURE`.
@@ -333,13 +333,13 @@ def tested_arms(evidence: Evidence, task: str) -> TestedArms:
         randomized.append(TestedArm(random, random))
         matched = _points(axis, evidence.arm_curve(task, axis, axis))
         trained = definition.training_severity.get(task)
-        own = [point for point in matched if point.severities[axis] == trained]
+        at_training = [point for point in matched if point.severities[axis] == trained]
         drawn = _points(axis, evidence.arm_curve(task, f"{axis}, drawn", axis))
         lower = [
             TestedPoint(severity, Outcome(outcome.lost - MARGIN, 0.0 * outcome.missed))
             for severity, outcome in drawn
         ]
-        through += [TestedArm(matched, own), TestedArm(drawn, lower)]
+        through += [TestedArm(matched, at_training), TestedArm(drawn, lower)]
     for name, real in REAL.get(task, {}).items():
         if (outcome := evidence.outcome(task, name, name)) is not None:
             actuator = study_env(task, real).actuators[0]
@@ -359,9 +359,10 @@ def _points(axis: str, curve: Mapping[float, Outcome]) -> list[TestedPoint]:
 def _reason(verdict: str, options: Mapping[str, LossBounds], response: ActuatorResponse) -> str:
     """Return the reason for a verdict as text, with everything that decides."""
     ideal_trained = options[IDEAL]
+    control = ideal_trained.lower
     text = f"policies trained on ideal forces lose {describe(ideal_trained)}"
     others = {name: options[name] for name in OPTIONS if name in options and name != IDEAL}
-    if verdict == IDEAL:
+    if verdict == IDEAL or control is None:
         return text
     if verdict == BUY:
         listed = [f"{name} {describe(option)}" for name, option in others.items()]
@@ -370,32 +371,30 @@ def _reason(verdict: str, options: Mapping[str, LossBounds], response: ActuatorR
             for name, option in others.items()
             if option.upper is not None
             and option.upper.failed == 1.0
-            and (won := _gains(ideal_trained, option.upper, name)["loss"]).low > MARGIN
+            and (won := gains(option.upper, control, name in SAME_POLICIES)["loss"]).low > MARGIN
         )
     if verdict == MEASURE:
-        return "; ".join([text, *_open_reasons(ideal_trained, others)])
-    details = {
-        COMMAND: f" (by {1.0 / response.at_rest:.2f})",
-        SENSOR: (
-            f" (filter or replace the current sensor: its noise is {response.noise:.2g} of the"
-            " largest force)"
-        ),
-    }
+        return "; ".join([text, *_open_reasons(control, others)])
+    detail = {
+        COMMAND: f" (by {1.0 / max(response.at_rest, 0.1):.2f})",
+        SENSOR: f" (filter or replace it: its noise is {response.noise:.2g} of the largest force)",
+    }.get(verdict, "")
     chosen = options[verdict]
-    text += f"; with this option{details.get(verdict, '')} {describe(chosen)}"
+    option = "an exact current sensor" if verdict == SENSOR else "this option"
+    text += f"; with {option}{detail} {describe(chosen)}"
     if chosen.upper is None or chosen.upper.is_negligible:
         return text
     decisive = [
         _describe_gain(name, gain)
-        for name, gain in _gains(ideal_trained, chosen.upper, verdict).items()
+        for name, gain in gains(chosen.upper, control, verdict in SAME_POLICIES).items()
         if gain.low > 0.0 and gain.mean > TOLERANCES[name]
     ]
     return f"{text}, certainly better by {' and '.join(decisive)}: buy another if that is too much"
 
 
-def _open_reasons(ideal_trained: LossBounds, others: Mapping[str, LossBounds]) -> Iterator[str]:
+def _open_reasons(control: Outcome, others: Mapping[str, LossBounds]) -> Iterator[str]:
     """Yield the reasons why no option is recommended."""
-    if ideal_trained.lower is None or ideal_trained.lower.is_negligible:
+    if control.is_negligible:
         yield "the tests do not tell whether it is too much"
         for name, option in others.items():
             if option.upper is not None and option.upper.is_negligible:
@@ -407,16 +406,9 @@ def _open_reasons(ideal_trained: LossBounds, others: Mapping[str, LossBounds]) -
         yield f"{names} was not tested at this severity on this task"
     for name, option in others.items():
         if option.upper is not None:
-            gained = _gains(ideal_trained, option.upper, name)
+            gained = gains(option.upper, control, name in SAME_POLICIES)
             text = ", ".join(_describe_gain(*gain) for gain in gained.items())
             yield f"{name} is not certainly better: it wins {text}"
-
-
-def _gains(ideal_trained: LossBounds, outcome: Outcome, option: str) -> dict[str, Interval]:
-    """Return how much less is certainly lost with an option than by ideal-trained policies."""
-    if ideal_trained.lower is None:
-        return {}
-    return gains(outcome, ideal_trained.lower, option in SAME_POLICIES)
 
 
 def _describe_gain(measure: str, gain: Interval) -> str:
@@ -424,7 +416,7 @@ def _describe_gain(measure: str, gain: Interval) -> str:
     if measure == "loss":
         return f"{gain.mean:z.2f} of the span ({gain.low:z.2f} to {gain.high:z.2f})"
     mean, low, high = (f"{100 * value:z.0f}" for value in gain)
-    return f"{mean} % of the {measure} ({low} to {high})"
+    return f"{mean} % {'fewer' if measure == 'failures' else 'more'} {measure} ({low} to {high})"
 
 
 def describe(option: LossBounds) -> str:

@@ -261,16 +261,16 @@ def ideal_arm(task: str) -> Arm:
 
 
 class RandomRanges(NamedTuple):
-    """Ranges of random actuators, from which a lag is drawn for every episode."""
+    """Ranges of random actuators, from which a lag is drawn for every episode.
+
+    Time constant and delay lie between 0 and `lag` or `delay` [policy steps], the delivered share
+    of the commanded force between `weakest` and `strongest`.
+    """
 
     lag: float
-    """Largest time constant [policy steps]; the smallest is 0."""
     weakest: float
-    """Smallest force, as a share of the commanded one."""
     strongest: float
-    """Largest force, as a share of the commanded one."""
     delay: float
-    """Largest delay [policy steps]; the smallest is 0."""
 
 
 RANDOM_RANGES: Mapping[str, RandomRanges] = {
@@ -282,10 +282,7 @@ RANDOM_RANGES: Mapping[str, RandomRanges] = {
 
 
 def generic_ranges(task: str) -> RandomRanges:
-    """Return the ranges of the arm `generic` of the first study, which exist for every task.
-
-    They are common practice where no model of the motor is available.
-    """
+    """Return the ranges of the arm `generic` of the first study, a common practice."""
     longest_delay = HISTORY * timestep(task) / find_task(task).step_duration
     return RandomRanges(2.0, 0.5, 1.25, longest_delay)
 
@@ -295,18 +292,8 @@ def random_ranges(task: str) -> RandomRanges:
     return RANDOM_RANGES.get(task, generic_ranges(task))
 
 
-def generic_arm(base: Arm) -> Arm:
-    """Return the arm trained with generic randomization: of strength, lag, delay and pushes."""
-    return random_arm(base, generic_ranges(base.task))
-
-
 def random_arm(base: Arm, ranges: RandomRanges) -> Arm:
-    """Return the arm trained on random actuators: of random strength, lag and delay, with pushes.
-
-    Args:
-        base: arm of a built-in task on ideal forces; all other settings are kept.
-        ranges: ranges of the random actuators.
-    """
+    """Return the arm trained on random actuators and pushes, from one on a built-in task."""
     env, step = base.config.env, find_task(base.task).step_duration
     drawn = (
         f"time_constant=uniform(0, {ranges.lag * step:g})",

@@ -240,13 +240,11 @@ def redesign_loop(actuator: ActuatorModel, task: str) -> Drive | None:
 
 def has_wind_up(actuator: ActuatorModel) -> bool:
     """Return True if the integrator of a current loop continues while the voltage saturates."""
-    if isinstance(actuator, DCMotorActuator):
-        return actuator.controller.ki > 0.0
-    if not isinstance(actuator, Drive):
-        return False
-    loop = actuator.controller
-    # Without own gains, the loop is designed, with an integrator.
-    return loop.anti_windup == "none" and (loop.ki > 0.0 or loop.kp == 0.0)
+    if isinstance(actuator, Drive):
+        loop = actuator.controller
+        # Without own gains, the loop is designed, with an integrator.
+        return loop.anti_windup == "none" and (loop.ki > 0.0 or loop.kp == 0.0)
+    return isinstance(actuator, DCMotorActuator) and actuator.controller.ki > 0.0
 
 
 def fix_sensor(actuator: ActuatorModel) -> DCMotorActuator | None:
@@ -254,7 +252,8 @@ def fix_sensor(actuator: ActuatorModel) -> DCMotorActuator | None:
     if not isinstance(actuator, DCMotorActuator):
         return None
     exact = dataclasses.replace(actuator.controller, current_noise=0.0, current_bias=0.0)
-    return None if exact == actuator.controller else dataclasses.replace(actuator, controller=exact)
+    fixed = dataclasses.replace(actuator, controller=exact)
+    return None if fixed == actuator else fixed
 
 
 def drive_with_designed_loop(actuator: DCMotorActuator, task: str) -> Drive:

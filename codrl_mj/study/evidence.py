@@ -30,11 +30,7 @@ STUDIES = ("actuators", "insurance")
 WIND_UP = "wind-up"
 """Effect of a missing anti-windup, beside the axes: the loss that it adds to a low supply's."""
 SUDDEN = (WIND_UP, "noise")
-"""Effects that set in suddenly: between two tested severities their loss is only bounded.
-
-On the Furuta pendulum wind-up costs 0.00 where 20 % of the voltage is missing, and 0.18 at 35 %;
-twice as much noise takes the success from 95 to 3 %.
-"""
+"""Effects that set in suddenly: between two tested severities their loss is only bounded."""
 _COLUMNS = ("task", "trained", "tested", "seed", "score", "success")
 
 
@@ -99,15 +95,9 @@ class Outcome(NamedTuple):
 
 
 def gains(treatment: Outcome, control: Outcome, paired: bool = False) -> dict[str, Interval]:
-    """Return how much less a treatment loses, as 95 % intervals of the differences.
+    """Return how much less a treatment loses, as 95 % intervals of the measures of `TOLERANCES`.
 
-    Args:
-        treatment: losses of the policies that may be better.
-        control: losses of the policies that they are compared with.
-        paired: True if both are losses of the same policies in the same order.
-
-    Returns:
-        `TOLERANCES` -> interval of the share of the span, of the policies or of the episodes.
+    `paired` is True if both are losses of the same policies in the same order.
     """
     paired = paired and len(treatment.lost) == len(control.lost)
     return {

@@ -155,6 +155,7 @@ def rows(evidence: Evidence) -> Iterator[dict[str, Any]]:
                 "actuator": name,
                 "kind": kind(test),
                 "beyond": bounds.upper is None,
+                "at_most": bounds.upper is not None and bounds.upper is not bounds.lower,
                 **{f"predicted_{key}": value for key, value in predicted.loss._asdict().items()},
                 **{f"measured_{key}": value for key, value in outcome.loss._asdict().items()},
                 "measured_failed": outcome.failed,

@@ -289,17 +289,16 @@ def _advised(
     for row in advice_rows:
         if row["judged"] != "right":
             numbers = (
-                f"{'≥ ' * row['beyond']}{row['predicted_mean']:z.2f}",
+                f"{'≥ ' * row['beyond']}{'≤ ' * row['at_most']}{row['predicted_mean']:z.2f}",
                 f"{row['measured_mean']:z.2f}",
             )
             rows.append(
                 [TITLES[row["task"]], row["actuator"], *numbers, row["said"], row["measured"]]
             )
-    errors = [abs(row["predicted_mean"] - row["measured_mean"]) for row in advice_rows]
+    exact = [row for row in advice_rows if not row["at_most"]]
+    errors = [abs(row["predicted_mean"] - row["measured_mean"]) for row in exact]
     large = [
-        error
-        for error, row in zip(errors, advice_rows, strict=True)
-        if row["measured_mean"] > MARGIN
+        error for error, row in zip(errors, exact, strict=True) if row["measured_mean"] > MARGIN
     ] or [0.0]
     judgments: dict[str, list[tuple[str, str]]] = {
         kind: [(row["said"], row["judged"]) for row in advice_rows if row["kind"] == kind]
@@ -331,7 +330,7 @@ rows, and is no test of them."""
 The actuators for which it was not right:
 
 {markdown_table(header, rows)}
-The mean error of the predicted loss is {np.mean(errors):.2f}, and {np.mean(large):.2f} where policies lose more than
+The mean error of the {len(exact)} predicted losses without ≤ is {np.mean(errors):.2f}, and {np.mean(large):.2f} where policies lose more than
 {MARGIN:g}. We also predicted {left["severities"]} severities from their neighbors: {left["off"]} errors exceed {MARGIN:g}
 (mean {left["mean_error"]:.3f}), and {left["flips"]} severities change between harmless and not harmless.
 

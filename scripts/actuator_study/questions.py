@@ -22,10 +22,11 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.axes import (
     AXES,
     SECONDS,
-    generic_arm,
+    generic_ranges,
     ideal_arm,
     ideal_trial,
     make_arm,
+    random_arm,
     study_env,
 )
 from codrl_mj.study.questions import Contrast, Question
@@ -47,7 +48,7 @@ def _contrasts(axis: str, arm_of: Any, reference_arm_of: Any) -> tuple[Contrast,
 
 @functools.cache
 def _generic(task: str) -> Arm:
-    return generic_arm(ideal_arm(task))
+    return random_arm(ideal_arm(task), generic_ranges(task))
 
 
 def on_loop(arm: Arm, loop: str) -> Trial:
