@@ -13,7 +13,16 @@ from actuator_study.by_task import judge_by_task
 from actuator_study.study import ActuatorStudy
 from codrl_mj.actuators import Lag
 from codrl_mj.disturbances import Disturbances
-from codrl_mj.study.axes import AXES, FLOORS, ideal_arm, ideal_trial, study_env, timestep
+from codrl_mj.study.axes import (
+    AXES,
+    FLOORS,
+    RANDOM_RANGES,
+    ideal_arm,
+    ideal_trial,
+    random_arm,
+    study_env,
+    timestep,
+)
 from codrl_mj.study.evidence import Evidence
 from codrl_mj.study.pages import read_csv, write_csv
 from codrl_mj.study.questions import Scores, judge
@@ -371,3 +380,13 @@ def test_training_time_is_counted_once_if_the_page_is_written_again(tmp_path):
     for _ in range(2):
         study.write()
         assert study.grid.collect().totals.seconds == 10.0 * len(grid.arms)
+
+
+def test_the_recommended_random_actuators_are_those_of_the_study():
+    """A lag stands for the study's own actuator; distributions, pushes and budget are the same."""
+    for task in TASKS:
+        recommended = random_arm(ideal_arm(task), RANDOM_RANGES[task]).config
+        trained = generic(task).config
+        assert sorted(recommended.env.randomize) == sorted(trained.env.randomize), task
+        assert recommended.env.disturbances == trained.env.disturbances
+        assert recommended.total_steps == trained.total_steps
