@@ -155,8 +155,8 @@ def test_the_study_computes_what_the_plan_states():
 def test_random_actuators_have_the_stated_ranges():
     for task in TASKS:
         step = find_task(task).step_duration
-        for share, random_arm in ((1.0, generic(task)), (0.5, half(task)), (2.0, double(task))):
-            env = random_arm.config.env
+        for share, arm in ((1.0, generic(task)), (0.5, half(task)), (2.0, double(task))):
+            env = arm.config.env
             ends = {
                 name: (distribution.low, distribution.high)
                 for name, distribution in env.distributions.items()
