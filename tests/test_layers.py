@@ -30,6 +30,10 @@ ALLOWED = {
         *("actuators", "arrays", "arrays.models", "arrays.draws", "arrays.warp"),
         *("arrays.warp_inertia", "fields"),
     },
+    "arrays.mjx": {
+        *("actuators", "arrays", "arrays.models", "arrays.draws"),
+        *("envs.motor_fields", "fields"),
+    },
     "arrays.mjlab": {"actuators", "arrays", "arrays.warp", "arrays.warp_inertia", "engine"},
     "disturbances": {"actuators", "fields"},
     "tasks": {"actuators", "fields", "user_code"},
@@ -255,6 +259,7 @@ LIBRARIES = {
     "arrays.warp_inertia": {"warp"},
     "arrays.draws": {"mujoco", "numpy"},
     "arrays.mujoco_warp": {"mujoco", "numpy"},
+    "arrays.mjx": {"jax", "mujoco", "numpy"},
     "arrays.mjlab": {"mjlab", "mujoco", "numpy", "torch", "warp"},
     "disturbances": {"numpy"},
     "tasks": {"numpy", "gymnasium", "mujoco"},

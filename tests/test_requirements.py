@@ -1,4 +1,4 @@
-"""Where packages of the simulation are missing or too old, imports say so and nothing is registered."""
+"""With packages of the simulation missing or too old, imports say so and register nothing."""
 
 import importlib.metadata
 import importlib.util

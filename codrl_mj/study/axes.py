@@ -27,6 +27,7 @@ from codrl_mj.actuators.parameters import FieldValue
 from codrl_mj.boundary import Argument
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.fields import command
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
 from codrl_mj.training import TrainConfig
@@ -315,14 +316,15 @@ def random_training(task: str) -> str:
     """Return the command that trains as in the studies on the actuators of `random_ranges`."""
     config = random_arm(ideal_arm(task), random_ranges(task)).config
     env, pushes = config.env, config.env.disturbances
-    drawn = " ".join(f'"{text}"' for text in env.randomize or ())
-    budget = "" if config.total_steps is None else f" --total-steps {config.total_steps}"
-    return (
-        f"codrl-mj train {task} --agent {config.agent.name}{budget}"
-        f" --actuator lag --env.timestep {env.timestep:g} --env.randomize {drawn}"
-        f" --env.disturbances.pulse-force {pushes.pulse_force:g}"
-        f" --env.disturbances.pulse-duration {pushes.pulse_duration:g}"
-        f" --env.disturbances.pulse-interval {pushes.pulse_interval:g} --out runs/random"
+    budget = [] if config.total_steps is None else ["--total-steps", config.total_steps]
+    return command(
+        *("train", task, "--agent", config.agent.name, *budget),
+        *("--actuator", "lag", "--env.timestep", f"{env.timestep:g}"),
+        *("--env.randomize", *(env.randomize or ())),
+        *("--env.disturbances.pulse-force", f"{pushes.pulse_force:g}"),
+        *("--env.disturbances.pulse-duration", f"{pushes.pulse_duration:g}"),
+        *("--env.disturbances.pulse-interval", f"{pushes.pulse_interval:g}"),
+        *("--out", "runs/random"),
     )
 
 

@@ -199,12 +199,12 @@ def test_a_choice_is_the_best_of_its_group_in_the_choosing_test(study):
     for task in MOTORS:
         for group in range(20):
             seeds = [100 + 5 * group + index for index in range(5)]
-            taken = {"random ideal-trained policy": seeds[0]}
+            chosen_seeds = {"random ideal-trained policy": seeds[0]}
             for rule, test in criteria.items():
                 best = max(drawn[task, "ideal", test, seed] for seed in seeds)
                 ties = [seed for seed in seeds if drawn[task, "ideal", test, seed] == best]
-                taken[rule] = min(ties)
-            for rule, seed in taken.items():
+                chosen_seeds[rule] = min(ties)
+            for rule, seed in chosen_seeds.items():
                 expected[task, rule, group] = seed, drawn[task, "ideal", "motor", seed]
             # The first and second policy trained through the motor of every five.
             seed = 100 + 10 * (group // 2) + 2 * (group % 2)

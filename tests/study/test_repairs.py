@@ -121,8 +121,8 @@ def test_only_seeds_of_all_arms_are_judged_and_two_are_needed(study):
 
 def test_published_rows_are_not_trained_again(study):
     assert not study.grid.cells
-    kept = [row for row in read_csv(study.out / FOLDER / RUNS) if row["seed"] != "3"]
-    write_csv(study.out / FOLDER / RUNS, kept)
+    remaining = [row for row in read_csv(study.out / FOLDER / RUNS) if row["seed"] != "3"]
+    write_csv(study.out / FOLDER / RUNS, remaining)
     assert {format_ranges(cost.missing) for cost in study.grid.costs()} == {"3 to 4"}
     (study.out / FOLDER / RUNS).unlink()
     assert len(study.grid.cells) == 5 * len(REPAIRS)
