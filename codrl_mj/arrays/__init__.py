@@ -2,6 +2,7 @@
 
 The reader executes the source of `advance` with symbols (`reader.py`), and a back end receives the
 operations: `c_code.py` writes C, `array_code.py` computes with arrays of numpy, torch or JAX.
+`writers.py` writes motors in the notations of other simulators, which know less of a motor.
 docs/arrays.md has examples.
 """
 
@@ -18,6 +19,8 @@ _PUBLIC = {
     "prepare_model": "codrl_mj.arrays.models",
     "SimulatorModel": "codrl_mj.arrays.models",
     "UnsupportedError": "codrl_mj.arrays.scalars",
+    "write_motor": "codrl_mj.arrays.writers",
+    "WrittenMotor": "codrl_mj.arrays.writers",
 }
 """Public names -> their modules, which are imported on first use."""
 

@@ -3,18 +3,22 @@
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
+from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from codrl_mj.actuators import Drive
+from codrl_mj.actuators import ActuatorModel, Drive, TorqueSpeed, resolve
 from codrl_mj.boundary import Argument
 from codrl_mj.cli.parsing import AsJson, Output
 from codrl_mj.cli.terminal import format_number, print_table, print_text
 from codrl_mj.fields import command
 from codrl_mj.plots import Plot
 from codrl_mj.sizing.limits import MotorReport, Quantity
+
+if TYPE_CHECKING:
+    from codrl_mj.arrays.written_losses import Comparison, LostField
 
 MotorName = Annotated[
     tyro.conf.Positional[str],
@@ -421,35 +425,79 @@ class New:
 
 @dataclasses.dataclass(frozen=True)
 class Write:
-    """Write a motor and its drive as a function of C, for other simulators and controllers.
+    """Write a motor and its drive for other simulators and controllers.
 
-    The function advances the drive by one step: it takes the state and the desired torque, position
-    and speed, and returns the torque, exactly as in the simulation (docs/arrays.md).
+    As C, the motor is a function that advances the drive by one step: it takes the state and the
+    desired torque, position and speed, and returns the torque, exactly as in the simulation. Other
+    notations know less of a motor, so tables show the fields without a place, the largest error of
+    the torque, and how far the motor and the written one move apart (docs/arrays.md).
 
     Example: codrl-mj motor write maxon-ec45-flat-50w --gear-ratio 20 --as c --out motor.c
     """
 
     name: MotorName
     changes: Settings = Changes()
-    language: Annotated[Literal["c"], tyro.conf.arg(name="as")] = "c"
-    """Language of the function: C99, without other files."""
+    target: Annotated[
+        Literal["c", "mjlab", "isaaclab", "newton", "dcmotor", "bam"], tyro.conf.arg(name="as")
+    ] = "c"
+    """Notation: C99; a configuration of mjlab or Isaac Lab; Python for Newton's model builder;
+    MuJoCo's <dcmotor>; or the parameters of BAM.
+    """
+    joint: str | None = None
+    """Regular expression of the joints' names, by default all; for <dcmotor> the joint's name."""
     out: Path | None = None
-    """File to write. Without it the function is printed."""
+    """File to write. Without it the text is printed."""
 
     def run(self) -> int:
-        """Write the file."""
-        from codrl_mj.arrays import c_function
+        """Write the file, and print what is lost."""
+        from codrl_mj.arrays import write_motor
         from codrl_mj.runs.files import atomic_write
 
-        text = c_function(self.changes.drive(self.name))
+        written = write_motor(self._actuator(), self.target, self.joint)
         if self.out is None:
-            print(text, end="")
-            return 0
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(self.out) as temporary:
-            temporary.write_text(text)
-        print(f"wrote {self.out}")
+            print(written.text, end="")
+        else:
+            self.out.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(self.out) as temporary:
+                temporary.write_text(written.text)
+            print(f"wrote {self.out}")
+        if written.comparison is not None:
+            _print_losses(written.lost, written.comparison, written.slides)
         return 0
+
+    def _actuator(self) -> ActuatorModel:
+        """Return the named torque-speed line, or the named drive with its changes."""
+        if self.changes == Changes():
+            actuator = resolve(self.name, None, "a motor on its own")
+            if isinstance(actuator, TorqueSpeed):
+                return actuator
+        return self.changes.drive(self.name)
+
+
+def _print_losses(lost: "Sequence[LostField]", comparison: "Comparison", slides: bool) -> None:
+    """Print what a notation cannot say of a motor."""
+    if lost:
+        columns = "field", "value", "effect"
+        rows = [
+            (path, value if isinstance(value, str) else format_number(value, 4), effect)
+            for row in lost
+            # The effect is that of all fields of the row, and is printed beside the first.
+            for path, value, effect in zip_longest(row.fields, row.values, [row.effect])
+        ]
+        print_table(
+            "Fields without a place", columns, rows, right=("value",), whole=("field", "value")
+        )
+    force, speed, position = ("N", "m/s", "m") if slides else ("N·m", "rad/s", "rad")
+    share = 100.0 * comparison.torque_error / comparison.stall_torque
+    print_text(
+        f"largest error of the steady torque: {comparison.torque_error:.3g} {force}, {share:.2g} %"
+        f" of the stall torque, at {comparison.error_speed:.4g} {speed} and a command of"
+        f" {comparison.error_torque:.4g} {force}"
+        if share > 1e-7
+        else "the steady torques are equal",
+        f"largest gap in a test motion of one second: {comparison.motion_gap:.2g} {position} of"
+        f" {comparison.motion_range:.3g} {position}",
+    )
 
 
 def save_plot(figure: Plot | Sequence[Plot], path: Path) -> None:
