@@ -131,15 +131,14 @@ from isaaclab.actuators import DCMotorCfg
 
 # At the joint, in {joint.force_unit} and {joint.speed_unit}. With gains of 0, the command is the \
 effort target.
-# Isaac Lab 3 prefers the names actuator_effort_limit and actuator_velocity_limit. Versions whose
-# friction is a coefficient without a unit cannot take this one.
+# Isaac Lab 2 calls the limits velocity_limit and effort_limit.
 ACTUATOR = DCMotorCfg(
     joint_names_expr=[{json.dumps(joint.name)}],
     stiffness=0.0,
     damping=0.0,
     saturation_effort={stall},
-    velocity_limit={speed},
-    effort_limit={limit},
+    actuator_velocity_limit={speed},
+    actuator_effort_limit={limit},
     armature={format_number(joint.additions.armature)},
     friction={friction},
     dynamic_friction={friction},

@@ -233,14 +233,15 @@ def steady_torque(actuator: ActuatorModel, desired: np.ndarray, speed: np.ndarra
     torque: np.ndarray = np.zeros_like(speed)
     for step in range(2):
         # With a huge inertia the speed is held, and friction is not limited to what stops a rotor.
-        inputs = Inputs(desired * arm, 0.0, speed / arm, step * timestep, 0.0, _HELD)
-        state, torque, _ = advance(family, np, parameters, timestep, state, inputs)
+        # The fields of `Inputs` are floats, but `advance` takes arrays in their place.
+        arrays: FamilyTuple = (desired * arm, 0.0, speed / arm, step * timestep, 0.0, _HELD)
+        state, torque, _ = advance(family, np, tuple(parameters), timestep, state, Inputs(*arrays))
     return torque / arm
 
 
 def _at_rest(actuator: ActuatorModel, zero: float | np.ndarray) -> FamilyTuple:
     """Return the state of an actuator at the start of an episode, of zeros of any shape."""
-    state = type(actuator).State
+    state: FamilyTuple = type(actuator).State
     return state(*[zero for _ in state._fields])
 
 
