@@ -11,7 +11,9 @@ SIMULATORS := .venv-simulators
 # mjlab asks for MuJoCo 3.11 and mujoco_warp 4.0 for MuJoCo 4; both run on MuJoCo 3.17, so they are installed without
 # the packages that they ask for.
 SIMULATOR_PACKAGES := warp-lang==1.19.0 mujoco-warp==4.0.0 mujoco-mjx==3.17.0 jax==0.10.2 jaxlib==0.10.2 \
-	opt_einsum==3.4.0 mjlab==1.6.0 mediapy==1.2.7 prettytable==3.18.0
+	opt_einsum==3.4.0 mjlab==1.6.0 mediapy==1.2.7 prettytable==3.18.0 newton==1.8.0
+# Tests run single classes of these, which also work in Python 3.11.
+WRITTEN_FOR := isaaclab==3.0.0 better-actuator-models==1.0.2 colorama==0.4.6
 INSTALL = $(BIN)/pip install --quiet --constraint constraints.txt --editable
 
 .PHONY: install demo test check mujoco4 simulators browser lint bench soak results docs pictures wheels clean
@@ -70,6 +72,7 @@ $(SIMULATORS)/.installed: pyproject.toml constraints.txt Makefile
 	@$(SIMULATORS)/bin/pip install --quiet --constraint constraints.txt --editable ".[train,render,view]" \
 		etils ipython ml_dtypes wcwidth hypothesis pytest pytest-xdist
 	@$(SIMULATORS)/bin/pip install --quiet --no-deps $(SIMULATOR_PACKAGES)
+	@$(SIMULATORS)/bin/pip install --quiet --no-deps --ignore-requires-python $(WRITTEN_FOR)
 	@touch $@
 
 simulators: $(SIMULATORS)/.installed  ## motors in mujoco_warp, MJX and mjlab, and actuators as Warp and JAX code

@@ -128,6 +128,7 @@ if "mujoco" in {module.name for module in pkgutil.iter_modules()}:
     use_a_model()
 assert main(["motor", "list"]) == 0
 assert main(["motor", "write", MOTOR, "--as", "c", "--out", "written.c"]) == 0
+assert main(["motor", "write", MOTOR, "--as", "mjlab", "--out", "written.py"]) == 0
 assert main(["train", "pendulum"]) == 2
 try:
     codrl_mj.make("pendulum")

@@ -99,7 +99,7 @@ _PLACES = (
     _Place(("supply.voltage",), "set actuator.vin of the loaded model", (*_LINES, "dcmotor")),
     _Place(
         ("supply.resistance",),
-        "added to the winding: it also resists currents that bypass the supply",
+        "added to the winding, also when it brakes",
         neutral=[0.0],
     ),
     _Place(
@@ -108,10 +108,10 @@ _PLACES = (
         (*_LINES, "dcmotor"),
         [math.inf],
     ),
-    _Place(("motor.inductance",), "the torque follows its command at once", ("dcmotor",)),
+    _Place(("motor.inductance",), "the torque is immediate", ("dcmotor",)),
     _Place(
         _of("controller", "sample_rate", "bandwidth", "kp", "ki", "anti_windup", "delayed"),
-        "no current loop: the torque follows its command at once",
+        "no current loop: the torque is immediate",
     ),
     _Place(
         ("controller.bemf_compensation",),
@@ -121,14 +121,14 @@ _PLACES = (
     # No target has a place for the gear's efficiency, but the effects differ.
     _Place(
         ("motor.gear_efficiency",),
-        "commands are met in full; only the limits are those of a driving gear",
+        "only limits have losses, those of a driving gear",
         ("dcmotor", "bam"),
         [1.0],
     ),
     _Place(("motor.gear_efficiency",), "the gear loses no torque", (*_LINES, "bam"), [1.0]),
     _Place(
         ("motor.gear_efficiency",),
-        "the gear loses as little torque in braking as in driving",
+        "braking has the losses of driving",
         (*_LINES, "dcmotor"),
         [1.0],
     ),
@@ -141,7 +141,7 @@ _PLACES = (
     _Place(("motor.load_inertia",), "the speed is not predicted within a step", neutral=[0.0]),
     _Place(
         ("motor.max_temperature",),
-        "nothing limits the temperature: the largest torque lasts",
+        "the temperature has no limit",
         neutral=[math.inf],
     ),
 )
@@ -166,15 +166,13 @@ def lost_fields(drive: Drive, target: str) -> tuple[LostField, ...]:
     motor = drive.motor
     if target not in _LINES and motor.torque_constant != motor.back_emf_constant:
         share = motor.torque_constant / motor.back_emf_constant
-        effect = (
-            f"one motor constant, kE: torques are kept, currents are {share:.4g} of the motor's"
-        )
+        effect = f"torques are kept; currents are {share:.4g} of the motor's"
         rows.append(lost(("motor.torque_constant",), effect))
     resistances = motor.thermal_resistance_winding, motor.thermal_resistance_housing
     if target == "dcmotor" and min(resistances) > 0.0:
-        rows.append(lost(_THERMAL[:4], "one thermal body: the winding warms too slowly at first"))
+        rows.append(lost(_THERMAL[:4], "one thermal body: it warms too slowly at first"))
     elif target != "dcmotor" and max(resistances) > 0.0:
-        rows.append(lost(_THERMAL, "the motor stays cold: its resistance and torque do not change"))
+        rows.append(lost(_THERMAL, "the motor does not warm"))
     return tuple(rows)
 
 

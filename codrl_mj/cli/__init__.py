@@ -96,7 +96,9 @@ _DESCRIPTION = (
 
 
 _OUTPUT_FILE_CHECKS: dict[str, Callable[[Path], None]] = {
-    **dict.fromkeys(("Evaluate", "Runs", "SimulateLog", "CompareLog", "RunBoard"), check_file),
+    **dict.fromkeys(
+        ("Evaluate", "Runs", "SimulateLog", "CompareLog", "RunBoard", "Write"), check_file
+    ),
     **dict.fromkeys(("Replay", "Report"), check_page),
     # The file of `render` may also be a folder of frames, which `check_film` checks itself.
     "Render": lambda path: check_writable(path.parent),

@@ -4,6 +4,7 @@ import ast
 import json
 import math
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -16,6 +17,7 @@ from codrl_mj.arrays.written_models import bam_torque, torque_speed_line, windin
 from codrl_mj.catalogue import motor_entry
 from codrl_mj.cli import main
 
+PAGE = Path(__file__).parents[2] / "docs" / "arrays.md"
 MOTOR = "maxon-ec45-flat-50w"
 CATALOGUE = Drive.from_motor_parameters(motor_entry(MOTOR).parameters)
 GEARED = CATALOGUE.replaced({"motor.gear_ratio": 20.0, "controller.max_current": 10.0})
@@ -280,3 +282,20 @@ def test_the_command_line_writes_a_line_and_refuses_its_winding(capsys, tmp_path
     assert "no resistance, which bam needs" in capsys.readouterr().err
     assert main(["motor", "write", str(line), "--as", "mjlab", "--gear-ratio", "3"]) == 2
     assert "is not a drive" in capsys.readouterr().err
+
+
+def test_the_page_shows_what_is_written():
+    page = PAGE.read_text()
+    assert f"```py\n{write_motor(GEARED, 'mjlab', '.*_hip').text}```" in page
+    unlimited = GEARED.replaced({"controller.max_current": math.inf})
+    for target, label in {"mjlab": "`mjlab`, `isaaclab`, `newton`"}.items() | {
+        (target, f"`{target}`") for target in ("dcmotor", "bam")
+    }:
+        cells = []
+        for drive in (GEARED, unlimited):
+            difference = write_motor(drive, target).comparison
+            share = 100.0 * difference.torque_error / difference.stall_torque
+            error = f"{share:.2g} % of the stall torque" if share > 1e-9 else "0"
+            motion = f"{difference.motion_gap:.2g} of {difference.motion_range:.2g} rad"
+            cells += [error, motion]
+        assert f"| {label} | {' | '.join(cells)} |" in page
