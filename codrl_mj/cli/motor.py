@@ -5,20 +5,18 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from codrl_mj.actuators import ActuatorModel, Drive, TorqueSpeed, resolve
+from codrl_mj.arrays.written_losses import Comparison, LostField
 from codrl_mj.boundary import Argument
 from codrl_mj.cli.parsing import AsJson, Output
 from codrl_mj.cli.terminal import format_number, print_table, print_text
 from codrl_mj.fields import command
 from codrl_mj.plots import Plot
 from codrl_mj.sizing.limits import MotorReport, Quantity
-
-if TYPE_CHECKING:
-    from codrl_mj.arrays.written_losses import Comparison, LostField
 
 MotorName = Annotated[
     tyro.conf.Positional[str],
@@ -474,7 +472,7 @@ class Write:
         return self.changes.drive(self.name)
 
 
-def _print_losses(lost: "Sequence[LostField]", comparison: "Comparison", slides: bool) -> None:
+def _print_losses(lost: Sequence[LostField], comparison: Comparison, slides: bool) -> None:
     """Print what a notation cannot say of a motor."""
     if lost:
         columns = "field", "value", "effect"
