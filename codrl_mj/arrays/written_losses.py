@@ -159,9 +159,9 @@ def lost_fields(drive: Drive, target: str) -> tuple[LostField, ...]:
         return LostField(fields, tuple(_value(drive, path) for path in fields), effect)
 
     rows = [
-        lost(place.fields, place.effect)
-        for place in _PLACES
-        if target not in place.targets and value_at(drive, place.fields[0]) not in place.neutral
+        lost(row.fields, row.effect)
+        for row in _PLACES
+        if target not in row.targets and value_at(drive, row.fields[0]) not in row.neutral
     ]
     motor = drive.motor
     if target not in _LINES and motor.torque_constant != motor.back_emf_constant:

@@ -102,9 +102,7 @@ def test_a_line_loses_nothing(target):
 
 
 def test_every_field_has_a_place_or_is_lost():
-    assert {path for place in _PLACES for path in place.fields} | {*_THERMAL} == {
-        *field_paths(Drive)
-    }
+    assert {path for row in _PLACES for path in row.fields} | {*_THERMAL} == {*field_paths(Drive)}
     changed = {
         "motor.gear_efficiency": 0.9,
         "motor.stribeck_friction": 1e-3,

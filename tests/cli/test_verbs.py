@@ -372,10 +372,10 @@ def test_a_motor_is_written_as_c(capsys, tmp_path):
     assert capsys.readouterr().out == f"wrote {out}\n"
     assert out.read_text() == text
     assert main([*words[:3], "--gear-ratio", "10"]) == 0
-    other = capsys.readouterr().out
-    assert other != text
+    shorter = capsys.readouterr().out
+    assert shorter != text
     # An existing file is replaced, and a folder is refused.
     assert main([*words[:3], "--gear-ratio", "10", "--out", str(out)]) == 0
-    assert out.read_text() == other
+    assert out.read_text() == shorter
     assert main([*words, "--out", str(out.parent)]) == 2
     assert "it is a folder: name a file" in capsys.readouterr().err

@@ -137,10 +137,10 @@ class IsaacLabActuator:
 def test_isaac_lab_clips_as_the_line(motor):
     """Run the class `DCMotor` alone, because its package needs Isaac Sim."""
     torch = pytest.importorskip("torch", reason="NOT RUN: torch is not installed: make simulators")
-    found = importlib.util.find_spec("isaaclab")
-    if found is None:
+    package = importlib.util.find_spec("isaaclab")
+    if package is None:
         pytest.skip("NOT RUN: Isaac Lab is not installed: pip install --no-deps isaaclab==3.0.0")
-    folder = Path(found.submodule_search_locations[0]) / "actuators"
+    folder = Path(package.submodule_search_locations[0]) / "actuators"
     future = ast.parse("from __future__ import annotations").body
     module = ast.Module([*future, classes_of(folder, "actuator_pd")["DCMotor"]], [])
     namespace = {
