@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 from codrl_mj.actuators import ActuatorModel, Drive, JointAdditions, TorqueSpeed
 from codrl_mj.arrays.c_code import c_function
-from codrl_mj.arrays.written_losses import Comparison, LostField, compare, lost_fields
+from codrl_mj.arrays.written_losses import LostField, WrittenComparison, compare, lost_fields
 from codrl_mj.arrays.written_models import (
     bam_parameters,
     dcmotor_element,
@@ -37,7 +37,7 @@ class WrittenMotor(NamedTuple):
     """True if the joint is a slide, so that forces [N] and speeds [m/s] are written."""
     lost: tuple[LostField, ...]
     """Fields of the motor that have no place in the notation."""
-    comparison: Comparison | None
+    comparison: WrittenComparison | None
     """Differences in torque and motion; None for C, which computes the same."""
 
 

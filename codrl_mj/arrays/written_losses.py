@@ -49,7 +49,7 @@ class LostField(NamedTuple):
     """Consequence."""
 
 
-class Comparison(NamedTuple):
+class WrittenComparison(NamedTuple):
     """Difference between a motor and its model in another simulator."""
 
     torque_error: float
@@ -182,7 +182,7 @@ def _value(drive: Drive, path: str) -> float | str:
     return words[value] if words else float(value)
 
 
-def compare(actuator: ActuatorModel, target: str) -> Comparison:
+def compare(actuator: ActuatorModel, target: str) -> WrittenComparison:
     """Compare a motor to its model in another simulator.
 
     Args:
@@ -199,7 +199,7 @@ def compare(actuator: ActuatorModel, target: str) -> Comparison:
     )
     worst = int(np.argmax(errors))
     ours, theirs = _motions(actuator, target, line)
-    return Comparison(
+    return WrittenComparison(
         float(errors[worst]),
         line.stall_torque,
         float(speeds[worst]),

@@ -14,8 +14,8 @@ from codrl_mj.actuators import ActuatorModel, Drive, GearMotor, TorqueSpeed
 from codrl_mj.actuators.shaft import RATED_TEMPERATURE, resistance_at
 
 
-class Winding(NamedTuple):
-    """Winding and gear of a motor whose command is a voltage."""
+class WrittenWinding(NamedTuple):
+    """WrittenWinding and gear of a motor whose command is a voltage."""
 
     gear: float
     """Turns of the shaft per turn of the joint, or per meter of a slide."""
@@ -60,7 +60,7 @@ def torque_speed_line(actuator: ActuatorModel) -> TorqueSpeed:
     )
 
 
-def winding_of(actuator: ActuatorModel, target: str) -> Winding:
+def winding_of(actuator: ActuatorModel, target: str) -> WrittenWinding:
     """Return the winding of a motor for a simulator that has one motor constant.
 
     With the back-EMF constant kE as this constant and the resistance R*kE/kT, a voltage gives the
@@ -78,11 +78,11 @@ def winding_of(actuator: ActuatorModel, target: str) -> Winding:
         # A supply of 1 V makes the control the share of the full voltage.
         constant = 1.0 / actuator.no_load_speed
         resistance = constant / actuator.stall_torque
-        return Winding(1.0, constant, resistance, 0.0, 1.0, actuator.max_torque)
+        return WrittenWinding(1.0, constant, resistance, 0.0, 1.0, actuator.max_torque)
     drive = _complete(actuator, target)
     motor, resistance = drive.motor, total_resistance(drive)
     constants = motor.back_emf_constant / motor.torque_constant
-    return Winding(
+    return WrittenWinding(
         1.0 / drive.arm_radius,
         motor.back_emf_constant,
         resistance * constants,
@@ -92,7 +92,7 @@ def winding_of(actuator: ActuatorModel, target: str) -> Winding:
     )
 
 
-def winding_torque(winding: Winding, desired: np.ndarray, speed: np.ndarray) -> np.ndarray:
+def winding_torque(winding: WrittenWinding, desired: np.ndarray, speed: np.ndarray) -> np.ndarray:
     """Return the steady torque [N*m] at the joint for a desired torque and a speed of the joint."""
     back_emf = winding.volts_per_speed * speed
     volts = np.clip(winding.volts_per_force * desired + back_emf, -winding.voltage, winding.voltage)

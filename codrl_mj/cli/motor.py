@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from codrl_mj.actuators import ActuatorModel, Drive, TorqueSpeed, resolve
-from codrl_mj.arrays.written_losses import Comparison, LostField
+from codrl_mj.arrays.written_losses import LostField, WrittenComparison
 from codrl_mj.boundary import Argument
 from codrl_mj.cli.parsing import AsJson, Output
 from codrl_mj.cli.terminal import format_number, print_table, print_text
@@ -472,7 +472,7 @@ class Write:
         return self.changes.drive(self.name)
 
 
-def _print_losses(lost: Sequence[LostField], comparison: Comparison, slides: bool) -> None:
+def _print_losses(lost: Sequence[LostField], comparison: WrittenComparison, slides: bool) -> None:
     """Print what a notation cannot say of a motor."""
     if lost:
         columns = "field", "value", "effect"

@@ -335,5 +335,5 @@ def test_the_example_of_the_page_runs(tmp_path, monkeypatch):
     exec(example, namespace)
     temperature = np.asarray(namespace["signals"]["drive"].temperature)
     assert temperature.shape == (64, 1)
-    # Each world has another resistance.
-    assert len({*namespace["signals"]["drive"].voltage[:, 0].tolist()}) > 50
+    # Each world has another resistance, and most motors are at their voltage limit.
+    assert len({*namespace["signals"]["drive"].current[:, 0].tolist()}) > 50
