@@ -333,7 +333,8 @@ def test_every_number_on_the_page_is_in_a_file(study, tmp_path):
         f"{float(first['effect']):+.3f} [{float(first['low']):+.3f}, {float(first['high']):+.3f}]"
         in page
     )
-    assert len(page.splitlines()) <= 190
+    # 54 of the lines are the actuators about which `advise` was asked.
+    assert len(page.splitlines()) <= 230
     assert len(list(csv.DictReader(files["runs.csv"].open()))) == len(study.policy_tests)
     assert (
         sum(file.stat().st_size for name, file in files.items() if name.endswith(".svg")) < 500_000
