@@ -96,17 +96,12 @@ _PLACES = (
     _Place(_of("motor", "gear_ratio", "arm_radius", "ambient_temperature"), "", _EVERYWHERE),
     _Place(_of("motor", "rotor_inertia", "viscous_friction", "coulomb_friction"), "", _EVERYWHERE),
     _Place(("controller.deadband",), "", _EVERYWHERE),
-    _Place(("supply.voltage",), "set actuator.vin of the loaded model", (*_LINES, "dcmotor")),
+    # BAM's file has no place for these two, but what to set instead is computed for each motor.
+    _Place(("supply.voltage", "controller.max_current"), "", _EVERYWHERE),
     _Place(
         ("supply.resistance",),
         "added to the winding, also when it brakes",
         neutral=[0.0],
-    ),
-    _Place(
-        ("controller.max_current",),
-        "set actuator.max_current of the loaded model",
-        (*_LINES, "dcmotor"),
-        [math.inf],
     ),
     _Place(("motor.inductance",), "the torque is immediate", ("dcmotor",)),
     _Place(
@@ -164,6 +159,14 @@ def lost_fields(drive: Drive, target: str) -> tuple[LostField, ...]:
         if target not in row.targets and value_at(drive, row.fields[0]) not in row.neutral
     ]
     motor = drive.motor
+    if target == "bam":
+        winding = winding_of(drive, target)
+        # Without this, BAM has the supply of the MX-106 that the file names, and 96 % of its duty.
+        effect = f"set actuator.vin = {winding.voltage:.6g} and max_pwm = 1 of the loaded model"
+        rows.append(lost(("supply.voltage",), effect))
+        if math.isfinite(winding.max_current):
+            effect = f"set actuator.max_current = {winding.max_current:.6g} of the loaded model"
+            rows.append(lost(("controller.max_current",), effect))
     if target not in _LINES and motor.torque_constant != motor.back_emf_constant:
         share = motor.torque_constant / motor.back_emf_constant
         effect = f"torques are kept; currents are {share:.4g} of the motor's"

@@ -15,7 +15,7 @@ from codrl_mj.actuators.shaft import RATED_TEMPERATURE, resistance_at
 
 
 class WrittenWinding(NamedTuple):
-    """WrittenWinding and gear of a motor whose command is a voltage."""
+    """Winding and gear of a motor whose command is a voltage."""
 
     gear: float
     """Turns of the shaft per turn of the joint, or per meter of a slide."""
@@ -29,6 +29,16 @@ class WrittenWinding(NamedTuple):
     """Largest voltage [V]."""
     max_torque: float
     """Largest torque [N*m] of the shaft, from the drive's current limit."""
+
+    @property
+    def max_force(self) -> float:
+        """Largest torque [N*m], or force [N], of the joint from the drive's current limit."""
+        return self.max_torque * self.gear
+
+    @property
+    def max_current(self) -> float:
+        """Largest current [A] of this winding, which has the torque of the drive's limit."""
+        return self.max_torque / self.constant
 
     @property
     def volts_per_force(self) -> float:
@@ -141,7 +151,12 @@ def bam_parameters(drive: ActuatorModel) -> dict[str, str | float]:
 def bam_torque(drive: ActuatorModel, desired: np.ndarray, speed: np.ndarray) -> np.ndarray:
     """Return BAM's steady torque at a moving joint, without Coulomb and viscous friction."""
     winding, motor = winding_of(drive, "bam"), _motor_of(drive)
-    torque = winding_torque(winding, desired, speed)
+    back_emf, limit = winding.volts_per_speed * speed, winding.volts_per_force * winding.max_force
+    # BAM limits the current before the voltage. As with our drives, a joint that turns fast enough
+    # drives more than the largest current through the winding.
+    volts = np.clip(winding.volts_per_force * desired, -limit, limit) + back_emf
+    volts = np.clip(volts, -winding.voltage, winding.voltage)
+    torque = (volts - back_emf) / winding.volts_per_force
     friction = (1.0 - motor.gear_efficiency) * np.abs(torque) + winding.gear * motor.stribeck(
         winding.gear * speed
     )

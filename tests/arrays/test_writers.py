@@ -31,6 +31,8 @@ LOSSY = GEARED.replaced(
         "supply.resistance": 0.1,
     }
 )
+# A tenth of the stall current, which the back-EMF alone exceeds slightly above the no-load speed.
+LIMITED = GEARED.replaced({"controller.max_current": 2.5, "motor.torque_constant": 0.03})
 LINE = TorqueSpeed(stall_torque=2.0, no_load_speed=30.0, max_torque=1.5)
 
 
@@ -148,6 +150,11 @@ def test_the_steady_torque_without_losses_is_that_of_a_winding():
     np.testing.assert_allclose(
         winding_torque(winding_of(drive, "dcmotor"), torques, speeds), ours, rtol=0.0, atol=1e-12
     )
+    # BAM limits the current before the voltage, as our drive does.
+    ours = steady_torque(LIMITED, torques, speeds)
+    limit = winding_of(LIMITED, "bam").max_force
+    assert (np.abs(ours) > 1.1 * limit).sum() > 10
+    np.testing.assert_allclose(bam_torque(LIMITED, torques, speeds), ours, rtol=0.0, atol=1e-9)
     # A driving motor of BAM loses the same torque in its gear.
     lossy = LOSSY.replaced({"controller.max_current": math.inf, "supply.resistance": 0.0})
     drives = torques * speeds > 0.0
@@ -157,7 +164,9 @@ def test_the_steady_torque_without_losses_is_that_of_a_winding():
     np.testing.assert_allclose(theirs[drives], ours[drives], rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("actuator", [GEARED, LOSSY, LINE], ids=["geared", "lossy", "line"])
+@pytest.mark.parametrize(
+    "actuator", [GEARED, LOSSY, LIMITED, LINE], ids=["geared", "lossy", "limited", "line"]
+)
 def test_mujoco_steps_a_dcmotor_to_the_steady_torque(actuator):
     text = write_motor(actuator, "dcmotor", "it").text
     comment, _, element = text.partition("-->")
@@ -222,6 +231,17 @@ def test_bam_gets_every_parameter_of_the_friction_model():
     )
     assert stribeck["model"] == "m2"
     assert "load_friction_motor" not in stribeck
+
+
+def test_the_voltage_and_current_to_set_in_bam_are_those_of_its_winding():
+    drive = LIMITED.replaced({"controller.deadband": 0.5})
+    effects = {row.fields[0]: row.effect for row in write_motor(drive, "bam").lost}
+    assert "actuator.vin = 23.5 and max_pwm = 1 " in effects["supply.voltage"]
+    current = 2.5 * 0.03 / drive.motor.back_emf_constant
+    assert f"actuator.max_current = {current:.6g} " in effects["controller.max_current"]
+    lost = lost_paths(write_motor(CATALOGUE, "bam"))
+    assert "supply.voltage" in lost
+    assert "controller.max_current" not in lost
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import ast
 import importlib.util
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -169,7 +170,8 @@ def test_isaac_lab_clips_as_the_line(motor):
     assert_equal_to_the_line(actuator._clip_effort(command, speed), expected)
 
 
-def test_bam_loads_the_file_and_computes_its_torque(tmp_path):
+@pytest.mark.parametrize("max_current", [2.5, 10.0, math.inf])
+def test_bam_loads_the_file_and_computes_its_torque(tmp_path, max_current):
     reason = "NOT RUN: BAM is not installed: pip install --no-deps better-actuator-models"
     load_model = pytest.importorskip("bam.model", reason=reason).load_model
 
@@ -178,6 +180,7 @@ def test_bam_loads_the_file_and_computes_its_torque(tmp_path):
             "motor.stribeck_friction": 0.004,
             "motor.stribeck_speed": 3.0,
             "motor.torque_constant": 0.03,
+            "controller.max_current": max_current,
         }
     )
     file = tmp_path / "motor.json"
@@ -188,14 +191,15 @@ def test_bam_loads_the_file_and_computes_its_torque(tmp_path):
     assert model.actuator.get_extra_inertia() == pytest.approx(motor.additions.armature)
     speeds, commands, _ = random_points(motor)
     winding = winding_of(motor, "bam")
-    volts = np.clip(
-        winding.volts_per_force * commands + winding.volts_per_speed * speeds,
-        -winding.voltage,
-        winding.voltage,
-    )
+    # The numbers that the table of losses asks to set.
+    model.actuator.vin, model.actuator.max_pwm = winding.voltage, 1.0
+    if math.isfinite(max_current):
+        model.actuator.max_current = winding.max_current
+    # BAM's command is a position, so the voltage is the one that its gains make of an error.
+    duty = (winding.volts_per_force * commands + winding.volts_per_speed * speeds) / winding.voltage
+    error = duty / (model.actuator.kp * model.actuator.error_gain)
+    volts = model.actuator.compute_control(error, 0.0, speeds, 0.001)
     torque = model.actuator.compute_torque(volts, True, 0.0, speeds)
-    limit = winding.max_torque * winding.gear
-    torque = np.clip(torque, -limit, limit)
     losses = [model.compute_frictions(t, 0.0, s)[0] for t, s in zip(torque, speeds, strict=True)]
     net = torque - (np.array(losses) - motor.additions.friction) * np.sign(speeds)
     np.testing.assert_allclose(net, bam_torque(motor, commands, speeds), rtol=0.0, atol=1e-7)
