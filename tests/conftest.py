@@ -73,5 +73,5 @@ def _remove_test_tasks():
 
 @pytest.fixture(autouse=True, scope="session")
 def _remove_columns():
-    """Remove COLUMNS, which processes COLUMNS, which processes have, so that tables are wide."""
+    """Remove COLUMNS, so that tables that tests read are wide."""
     os.environ.pop("COLUMNS", None)
