@@ -1,7 +1,7 @@
 """Symbols, back ends and nested tuples: the values that the reader computes with.
 
-The reader executes a function with symbols in place of numbers. A symbol is a `Scalar`: its kind,
-and whatever a back end uses to represent it, for example the name of a C variable or an array.
+The reader executes a function with symbols in place of numbers. A symbol is a `Scalar`. It has a
+kind, and an operand that stands for it in a back end: in C the name of a variable, else an array.
 """
 
 import dataclasses

@@ -216,9 +216,7 @@ class WarpActuators:
         Raises:
             ValueError: the family has no such signal.
         """
-        names = self.family.Signals._fields
-        check_names([name], names, "signal")
-        return _slice(self._signals, names.index(name), (self.num_worlds, len(self.actuators)))
+        return self._view(self._signals, self.family.Signals._fields, name, "signal")
 
     def state(self, name: str) -> Array:
         """Return a view of an entry of the state before the last step, shape (worlds, actuators).
@@ -226,9 +224,12 @@ class WarpActuators:
         Raises:
             ValueError: the family has no such entry.
         """
-        names = self.family.State._fields
-        check_names([name], names, "entry of the state")
-        return _slice(self._states, names.index(name), (self.num_worlds, len(self.actuators)))
+        return self._view(self._states, self.family.State._fields, name, "entry of the state")
+
+    def _view(self, table: Array, names: Sequence[str], name: str, kind: str) -> Array:
+        """Return a view of one of a table's entries, shape (worlds, actuators)."""
+        check_names([name], names, kind)
+        return _slice(table, names.index(name), (self.num_worlds, len(self.actuators)))
 
     def draw_noise_keys(self, generator: np.random.Generator) -> None:
         """Give each actuator in each world another random key for its sensor's noise."""
