@@ -21,8 +21,13 @@ pathlib.Path.exists = lambda path, **options: not path.is_relative_to("/proc") a
 
 import codrl_mj
 
+SIMULATORS = {"warp", "mujoco_warp", "mjlab", "jax"}
 for module in pkgutil.walk_packages(codrl_mj.__path__, "codrl_mj."):
-    importlib.import_module(module.name)
+    try:
+        importlib.import_module(module.name)
+    except ModuleNotFoundError as error:  # An adapter of a simulator that is not installed.
+        if not module.name.startswith("codrl_mj.arrays.") or error.name not in SIMULATORS:
+            raise
 from codrl_mj import cli
 
 sys.exit(cli.main(sys.argv[1:]))
