@@ -4,19 +4,28 @@ from codrl_mj.catalogue.datasheet import (
     Datasheet,
     MotorEntry,
     from_datasheet,
+    joint_names,
     motor_entry,
     motor_names,
     new_motor,
 )
-from codrl_mj.catalogue.derivation import Disagreement, MotorParameters
+from codrl_mj.catalogue.derivation import (
+    Disagreement,
+    IncompleteError,
+    MotorParameters,
+    TorqueSpeedLine,
+)
 
 __all__ = [
     "Datasheet",
     "from_datasheet",
     "MotorParameters",
     "Disagreement",
+    "IncompleteError",
+    "TorqueSpeedLine",
     "MotorEntry",
     "motor_entry",
     "motor_names",
+    "joint_names",
     "new_motor",
 ]

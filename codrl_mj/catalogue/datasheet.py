@@ -7,7 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from codrl_mj.catalogue.derivation import MotorParameters, derive
+from codrl_mj.catalogue.derivation import (
+    IncompleteError,
+    MotorParameters,
+    TorqueSpeedLine,
+    derive,
+    derive_line,
+)
 from codrl_mj.catalogue.units import ParsedValue, QuantitySpec, parse_value
 from codrl_mj.fields import check_names, command
 from codrl_mj.user_code import asset_folder, read_text
@@ -37,8 +43,8 @@ class Datasheet:
 
     Any sufficient combination is accepted: the nominal voltage with stall torque, stall current,
     no-load speed and no-load current; or resistance and torque constant (or back-EMF constant, or
-    speed constant); or both, which are then compared. The inductance, or an electrical time
-    constant, is always needed.
+    speed constant); or both, which are then compared. A winding also needs the inductance, or an
+    electrical time constant; without a winding, there may be a `torque_speed_line`.
 
     Electrical values are those at the two terminals. For a three-phase motor these are resistance
     and inductance between two phases (as maxon, T-Motor and most makers print them), with the
@@ -77,6 +83,11 @@ class Datasheet:
     """Speed at the nominal voltage and the continuous current."""
     peak_current: str | None = _printed("A", "24 A", synonyms="max_current")
     """Largest current of the motor or the drive."""
+    peak_torque: str | None = _printed("N*m", "17 N*m", -1, synonyms="max_torque")
+    """Largest torque of the motor or the drive; it replaces a `peak_current` that is not printed.
+    """
+    pole_pairs: str | float | None = _printed("", "7")
+    """Number of pole pairs; needed only for electrical speeds, such as "60000 eRPM"."""
     resistance: str | None = _printed("ohm", "0.464 ohm")
     """Resistance between the terminals."""
     inductance: str | None = _printed("H", "0.322 mH")
@@ -130,8 +141,12 @@ class Datasheet:
                 exceeds 1; or the shaft of a value is not stated although there is a gear.
         """
         printed_values = {name: getattr(self, name) for name in QUANTITY_SPECS}
+        pole_pairs = None
+        if self.pole_pairs is not None:
+            spec = QUANTITY_SPECS["pole_pairs"]
+            pole_pairs = parse_value("pole_pairs", self.pole_pairs, spec).value
         parsed_values = {
-            name: parse_value(name, printed, QUANTITY_SPECS[name])
+            name: parse_value(name, printed, QUANTITY_SPECS[name], pole_pairs)
             for name, printed in printed_values.items()
             if printed is not None
         }
@@ -182,6 +197,21 @@ class Datasheet:
         """Return the motor's parameters in SI units; see `from_datasheet`."""
         return derive(self.parsed_values(), QUANTITY_SPECS, strict, tolerance)
 
+    def torque_speed_line(self, tolerance: float = 0.2) -> TorqueSpeedLine | None:
+        """Return the torque-speed line if the values determine no winding; otherwise None.
+
+        Raises:
+            ValueError: the values determine neither, or contradict each other.
+        """
+        try:
+            self.parameters(tolerance=tolerance)
+        except IncompleteError as error:
+            line = derive_line(self.parsed_values(), QUANTITY_SPECS, tolerance, str(error))
+            if line is None:
+                raise
+            return line
+        return None
+
 
 QUANTITY_SPECS: dict[str, QuantitySpec] = {
     f.name: f.metadata["spec"] for f in dataclasses.fields(Datasheet) if "spec" in f.metadata
@@ -196,9 +226,9 @@ _PHASE = (
     "write the value between two phases: twice that of a phase for a star, two thirds for a delta"
 )
 _UNSUPPORTED = {
-    "pole_pairs": (
-        "omit it: speeds are those of the rotor; if electrical rpm are printed, divide"
-        " them by the number of pole pairs"
+    "flux_linkage": (
+        "write the amplitude between two phases: sqrt(3) * pole pairs * flux of a phase of a star,"
+        ' back_emf_constant = "1.7321 * 14 * 0.0045 V*s/rad"'
     ),
     "phase_resistance": f'{_PHASE}, resistance = "2 * 0.3 ohm"',
     "phase_inductance": f'{_PHASE}, inductance = "2 * 0.1 mH"',
@@ -294,13 +324,23 @@ class MotorEntry:
 
     @functools.cached_property
     def parameters(self) -> MotorParameters:
-        """Parameters derived from the datasheet, in SI units."""
+        """Parameters from the datasheet, in SI units; an `IncompleteError` without a winding."""
         return self.datasheet.parameters(tolerance=self.tolerance)
+
+    @functools.cached_property
+    def line(self) -> TorqueSpeedLine | None:
+        """Torque-speed line of a datasheet that determines no winding; None if it does."""
+        return self.datasheet.torque_speed_line(self.tolerance)
 
 
 def motor_names() -> list[str]:
-    """Return the names of the motors in the catalogue."""
+    """Return the names of the motors in the catalogue whose datasheets determine a winding."""
     return sorted(path.stem for path in (asset_folder() / "motors").glob("*.toml"))
+
+
+def joint_names() -> list[str]:
+    """Return the names in the catalogue that are known only by their torque-speed line."""
+    return sorted(path.stem for path in (asset_folder() / "joints").glob("*.toml"))
 
 
 def new_motor(path: Path) -> None:
@@ -321,8 +361,8 @@ def motor_entry(name: str) -> MotorEntry:
     """Return a motor of the catalogue, or of a file.
 
     Args:
-        name: one of `motor_names()`, or the path of a custom TOML file, which needs only
-            the table [datasheet].
+        name: one of `motor_names()` or `joint_names()`, or the path of a custom TOML file, which
+            needs only the table [datasheet].
 
     Raises:
         ValueError: there is no such motor (the message suggests the nearest); the file lacks an
@@ -330,8 +370,9 @@ def motor_entry(name: str) -> MotorEntry:
     """
     path = Path(name)
     if path.suffix != ".toml":
-        check_names([name], motor_names(), "motor", listed_by="codrl-mj motor list")
-        path = asset_folder() / "motors" / f"{name}.toml"
+        check_names([name], motor_names() + joint_names(), "motor", listed_by="codrl-mj motor list")
+        folder = "joints" if name in joint_names() else "motors"
+        path = asset_folder() / folder / f"{name}.toml"
     try:
         return _entry(path.stem, tomllib.loads(read_text(path)), name.endswith(".toml"))
     except FileNotFoundError as error:
@@ -369,8 +410,8 @@ def _entry(name: str, content: dict[str, Unchecked], is_custom: bool) -> MotorEn
         "datasheet": Datasheet(**printed),
         "estimated": to_field_names(content["estimated"]),
     }
-    # The parameters are derived now, so that an invalid file is rejected when it is read.
-    _ = MotorEntry(**content).parameters
+    # Winding or line is derived now, so that an invalid file is rejected when it is read.
+    _ = MotorEntry(**content).line
     check_names(content["estimated"], printed, "entry", "estimated.")
     printed_names = [
         key for key in printed if key in QUANTITY_SPECS and key not in content["estimated"]

@@ -85,6 +85,14 @@ RULES = (
         ),
     ),
     ("thermal_resistance", "thermal_resistance_winding + thermal_resistance_housing"),
+    ("peak_current", "peak_torque / torque_constant + no_load_current"),
+    (
+        "peak_current",
+        (
+            "peak_torque_at_output / (gear_ratio * gear_efficiency * torque_constant) +"
+            " no_load_current"
+        ),
+    ),
 )
 _LOAD = (
     "the shaft's torque is kT*(I - I0) here, many makers print kT*I; iron saturates at stall; warm"
@@ -249,7 +257,29 @@ class MotorParameters:
     """
 
 
-AT_OUTPUT = ("stall_torque_at_output", "continuous_torque_at_output", "torque_constant_at_output")
+class IncompleteError(ValueError):
+    """A datasheet determines no winding: a quantity is missing."""
+
+
+class TorqueSpeedLine(NamedTuple):
+    """Line from stall torque to no-load speed at the output, for a datasheet without a winding."""
+
+    stall_torque: float
+    """Torque [N*m] of the blocked output."""
+    no_load_speed: float
+    """Speed [rad/s] of the free output."""
+    max_torque: float | None
+    """Largest torque [N*m] of the motor or its drive; None if unknown."""
+    reason: str
+    """Sentence that names the quantity without which there is no winding, and a remedy."""
+
+
+AT_OUTPUT = (
+    "stall_torque_at_output",
+    "continuous_torque_at_output",
+    "peak_torque_at_output",
+    "torque_constant_at_output",
+)
 """Torques and torque constant that include a gear's losses. The motor's own values follow from them
 only if the efficiency of the gear is known.
 """
@@ -302,7 +332,7 @@ def derive(
     derivation.apply_rules()
     for name, remedy in _NEEDED.items():
         if name not in values:
-            raise ValueError(
+            raise IncompleteError(
                 f"datasheet.{name} is not printed and does not follow from the printed values:"
                 f" add {remedy}"
             )
@@ -315,7 +345,68 @@ def derive(
     if "no_load_current" in printed:
         derivation.derive_friction()
     disagreements = derivation.disagreements(printed)
-    if strict and disagreements and not abs(disagreements[0].difference) <= tolerance:
+    if strict:
+        _check_agreement(derivation, disagreements, tolerance)
+    for name, field in PRINTED_NAMES.items():
+        if field in values:
+            values[name] = values[field]
+            origins[name] = origins[field].replace(field, name, 1)
+            origins[name] += f" as {field}" if field in printed else ""
+    names = [
+        f.name
+        for f in dataclasses.fields(MotorParameters)
+        if f.name not in ("derived", "disagreements")
+    ]
+    return MotorParameters(
+        **{name: values.get(name) for name in names},  # type: ignore[arg-type]
+        derived={name: origins[name] for name in names if name in values},
+        disagreements=disagreements,
+    )
+
+
+def derive_line(
+    parsed_values: Mapping[str, ParsedValue],
+    specs: Mapping[str, QuantitySpec],
+    tolerance: float,
+    reason: str,
+) -> TorqueSpeedLine | None:
+    """Return the line from stall torque to no-load speed; None if it does not follow.
+
+    A gear without a known efficiency has no losses here.
+
+    Raises:
+        ValueError: printed values contradict each other.
+    """
+    derivation = _Derivation(parsed_values, specs)
+    values, printed = derivation.values, {*derivation.values, "torque_constant"}
+    values.setdefault("no_load_current", 0.0)
+    derivation.apply_rules()
+    derivation.complete_gear(strict=True, tolerance=tolerance)
+    _check_agreement(derivation, derivation.disagreements(printed), tolerance)
+    ratio = values["gear_ratio"]
+    for torque in ("stall_torque", "peak_torque"):
+        current = values.get(torque.replace("torque", "current"))
+        if torque not in values and "torque_constant" in values and current is not None:
+            values[torque] = values["torque_constant"] * (current - values["no_load_current"])
+        if torque in values:
+            loss = values.get("gear_efficiency", 1.0)
+            values.setdefault(f"{torque}_at_output", ratio * loss * values[torque])
+    if "no_load_speed" not in values and values.keys() >= {"back_emf_constant", "stall_current"}:
+        voltage = values["nominal_voltage"]
+        drop = voltage * values["no_load_current"] / values["stall_current"]
+        values["no_load_speed"] = (voltage - drop) / values["back_emf_constant"]
+    if not values.keys() >= {"stall_torque_at_output", "no_load_speed"}:
+        return None
+    stall, peak = values["stall_torque_at_output"], values.get("peak_torque_at_output")
+    return TorqueSpeedLine(stall, values["no_load_speed"] / ratio, peak, reason)
+
+
+def _check_agreement(
+    derivation: "_Derivation", disagreements: Sequence[Disagreement], tolerance: float
+) -> None:
+    """Raise if the largest disagreement exceeds the tolerance."""
+    values = derivation.values
+    if disagreements and not abs(disagreements[0].difference) <= tolerance:
         worst = disagreements[0]
         sources = ", ".join(
             derivation.printed_sources([worst.quantity, *derivation.quantities_in(worst.formula)])
@@ -330,22 +421,6 @@ def derive(
             f" {worst}. Check the values and units of {sources}; raise tolerance, or pass"
             " strict=False, if the manufacturer does print these values"
         )
-    for name, field in PRINTED_NAMES.items():
-        if field in printed:
-            values[name], origins[name] = (
-                values[field],
-                origins[field].replace(field, name, 1) + f" as {field}",
-            )
-    names = [
-        f.name
-        for f in dataclasses.fields(MotorParameters)
-        if f.name not in ("derived", "disagreements")
-    ]
-    return MotorParameters(
-        **{name: values.get(name) for name in names},  # type: ignore[arg-type]
-        derived={name: origins[name] for name in names if name in values},
-        disagreements=disagreements,
-    )
 
 
 def _includes_gear_loss(

@@ -97,10 +97,13 @@ class ParsedValue(NamedTuple):
     """`motor`, `output`, or None if not stated."""
 
 
-def parse_value(name: str, printed: object, spec: QuantitySpec) -> ParsedValue:
+def parse_value(
+    name: str, printed: object, spec: QuantitySpec, pole_pairs: float | None = None
+) -> ParsedValue:
     """Parse a printed value, such as `25.1 mN*m/A`, `2 * 0.3 ohm` or `2.42 N*m at output`.
 
-    The value of a quantity without a unit, such as a gear ratio, may also be a number.
+    The value of a quantity without a unit, such as a gear ratio, may also be a number. With
+    `pole_pairs` a speed may be electrical (eRPM), and a constant per electrical speed.
 
     Raises:
         ValueError: the value has no unit, a wrong or unknown one, more than one number, or is not
@@ -135,16 +138,20 @@ def parse_value(name: str, printed: object, spec: QuantitySpec) -> ParsedValue:
             f"datasheet.{name} = {printed!r}: must be one number, without a space or a comma in it;"
             f" {remedy}"
         )
-    if re.search(r"(?i)\be-?rpm", unit):
+    # Electrical turns are pole pairs times as many as those of the rotor.
+    mechanical_unit = re.sub(r"(?i)\be-?rpm", "rpm", unit)
+    if mechanical_unit != unit and pole_pairs is None:
         raise ValueError(
-            f"datasheet.{name} = {printed!r}: is an electrical speed; divide it by the"
-            " number of pole pairs, and write rpm"
+            f"datasheet.{name} = {printed!r}: is an electrical speed; write pole_pairs = 7, or"
+            " divide it by the number of pole pairs and write rpm"
         )
+    turns = 1.0 if mechanical_unit == unit else float(pole_pairs or 1.0)
+    turns = turns if "/" in mechanical_unit.partition("rpm")[0] else 1.0 / turns
     if not unit and spec.unit:
         raise ValueError(f"datasheet.{name} = {printed!r}: has no unit; {remedy}")
     try:
         number = float(math.prod(map(float, factors.split("*"))))
-        value = float(to_si(number, unit, spec.unit, mass_as_weight=True))
+        value = float(turns * to_si(number, mechanical_unit, spec.unit, mass_as_weight=True))
     except ValueError as error:
         raise ValueError(f"datasheet.{name} = {printed!r}: {error}; {remedy}") from error
     bound = "a finite number >= 0" if spec.allow_zero else "a finite number > 0"

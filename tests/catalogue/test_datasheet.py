@@ -381,6 +381,63 @@ def test_values_are_read_in_manufacturers_spellings(name, printed, value):
     assert reading.value == pytest.approx(value, rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("name", "printed", "mechanical"),
+    [
+        ("no_load_speed", "60000 eRPM", "6000 rpm"),
+        ("kv", "3600 erpm/V", "360 rpm/V"),
+        ("ke", "0.1 mV/eRPM", "1 mV/rpm"),
+    ],
+)
+def test_electrical_turns_are_pole_pairs_times_as_many(name, printed, mechanical):
+    fields = to_field_names({"pole_pairs": 10, name: printed})
+    electrical = Datasheet(**fields).parsed_values()
+    ((field, plain),) = Datasheet(**to_field_names({name: mechanical})).parsed_values().items()
+    assert electrical[field].value == pytest.approx(plain.value, rel=1e-12)
+
+
+def test_a_peak_torque_yields_the_peak_current():
+    constants = {**GEARED, "torque_constant": "0.1 N*m/A at motor", "no_load_current": "1 A"}
+    at_motor = from_datasheet(**constants, max_torque="2 N*m at motor")
+    assert at_motor.max_current == pytest.approx(2.0 / 0.1 + 1.0)
+    at_output = from_datasheet(
+        **constants, gear_efficiency=0.5, peak_torque="10 N*m at output", shaft="motor"
+    )
+    assert at_output.max_current == pytest.approx(10.0 / (10.0 * 0.5 * 0.1) + 1.0)
+    assert at_output.derived["max_current"].startswith("max_current = peak_torque_at_output / ")
+    printed = from_datasheet(**constants, peak_current="7 A", continuous_current="3 A")
+    assert printed.max_current == 7.0
+
+
+@given(st.data(), st.floats(1.0, 500.0))
+def test_without_a_winding_there_is_the_torque_speed_line(data, ratio):
+    """Two printed points, or resistance, voltage and constant without an inductance."""
+    motor, printed = data.draw(_motors())
+    points = {name: printed[name] for name in ("stall_torque", "no_load_speed")}
+    text = data.draw(_print(points))
+    line = Datasheet(gear_ratio=f"{ratio!r}", shaft="motor", **text).torque_speed_line()
+    assert line.stall_torque == pytest.approx(ratio * printed["stall_torque"], rel=1e-12)
+    assert line.no_load_speed == pytest.approx(printed["no_load_speed"] / ratio, rel=1e-12)
+    assert line.max_torque is None
+    constants = {name: motor[name] for name in ("resistance", "torque_constant")}
+    constants |= {name: printed[name] for name in ("nominal_voltage", "no_load_current")}
+    text = data.draw(_print(constants))
+    line = Datasheet(**text, peak_torque="1 N*m").torque_speed_line()
+    assert line[:3] == pytest.approx(
+        (printed["stall_torque"], printed["no_load_speed"], 1.0), rel=1e-11
+    )
+    assert "datasheet.inductance is not printed" in line.reason
+    assert Datasheet(**text, inductance="1 mH").torque_speed_line() is None
+
+
+def test_raises_if_neither_a_winding_nor_a_line_follows():
+    with pytest.raises(ValueError, match=r"resistance is not printed"):
+        Datasheet(stall_torque="1 N*m").torque_speed_line()
+    contradicting = {**CIM, "inductance": None, "stall_torque": "2.42 mN*m"}
+    with pytest.raises(ValueError, match="units of stall_torque"):
+        Datasheet(**contradicting).torque_speed_line()
+
+
 REFUSED = {
     "no unit": ({"resistance": "25.1"}, "resistance", "25.1", 'resistance = "0.464 ohm"'),
     "a number": ({"resistance": 25.1}, "resistance", "25.1", 'resistance = "0.464 ohm"'),
@@ -390,9 +447,9 @@ REFUSED = {
         {"no_load_speed": "9000 eRPM"},
         "no_load_speed",
         "9000 eRPM",
-        "number of pole pairs",
+        "write pole_pairs = 7",
     ),
-    "pole pairs": ({"pole_pairs": 14}, "pole_pairs", "omit it", "electrical rpm"),
+    "a flux": ({"flux_linkage": "4.5 mWb"}, "flux_linkage", "sqrt(3) * pole pairs"),
     "a phase": (
         {"phase_resistance": "0.3 ohm"},
         "phase_resistance",
