@@ -126,7 +126,7 @@ def compile_error_message(function: UserFunction, error: Exception) -> str:
 
 
 def asset_folder() -> Path:
-    """Return the folder with MJCF files and `motors/`: `assets/`, or `_assets/` in a wheel."""
+    """Return the folder of MJCF files, `motors/`, `joints/`: `assets/`, in a wheel `_assets/`."""
     package = Path(__file__).parent
     for folder in (package / "_assets", package.parent / "assets"):
         if folder.is_dir():

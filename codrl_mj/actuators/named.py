@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import functools
 import itertools
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard, TypeVar
@@ -15,6 +16,8 @@ from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name
 from codrl_mj.actuators.parameters import FieldValue
 from codrl_mj.actuators.servo import Servo
+from codrl_mj.actuators.torque_speed import TorqueSpeed
+from codrl_mj.catalogue import joint_names, motor_entry, motor_names
 from codrl_mj.user_code import allow_imports_from_files, look_up, read_yaml
 
 Named = TypeVar("Named", bound=ActuatorModel)
@@ -135,8 +138,6 @@ def _unshared(actuator: ActuatorModel) -> ActuatorModel:
 
 @functools.cache
 def _catalogue() -> dict[str, ActuatorModel | GearMotor]:
-    from codrl_mj.catalogue import motor_entry, motor_names
-
     return {
         name: _without_gear(Drive.from_motor_parameters(motor_entry(name).parameters))
         for name in motor_names()
@@ -185,6 +186,10 @@ def resolve(actuator: ActuatorSetting, paper: DCMotorActuator | None, owner: str
         paper: the actuator that the names in `NAMED` vary; None if there is none.
         owner: description of the task or environment that gets the actuator, for messages.
 
+    Returns:
+        The actuator. A datasheet gives a drive, or a `torque_speed` actuator if it determines no
+        winding.
+
     Raises:
         ValueError: unknown name or field, or a value out of bounds.
     """
@@ -221,17 +226,14 @@ def resolve(actuator: ActuatorSetting, paper: DCMotorActuator | None, owner: str
         return NAMED[actuator][1](paper)
     if actuator not in FAMILIES and Path(actuator).suffix in _FILES:
         return _from_file(Path(actuator), paper, owner)
-    from codrl_mj.catalogue import motor_entry, motor_names
-
-    if actuator in motor_names() or Path(actuator).suffix == ".toml":
-        return set_display_name(
-            Drive.from_motor_parameters(motor_entry(actuator).parameters), Path(actuator).stem
-        )
+    known = motor_names() + joint_names()
+    if actuator in known or Path(actuator).suffix == ".toml":
+        return set_display_name(_from_catalogue(actuator), Path(actuator).stem)
     imported = look_up(
         actuator,
         {**NAMED, **FAMILIES},
         "actuator",
-        suggestions={"the motors of `codrl-mj motor list`": motor_names()},
+        suggestions={"the motors of `codrl-mj motor list`": known},
     )
     if is_family(imported):
         return resolve(imported, paper, owner)
@@ -240,6 +242,21 @@ def resolve(actuator: ActuatorSetting, paper: DCMotorActuator | None, owner: str
     raise ValueError(
         f"actuator = {actuator!r}: {imported!r} must be an actuator or a family of actuators"
     )
+
+
+def _from_catalogue(name: str) -> ActuatorModel:
+    """Return a datasheet's drive, or a torque source if only a torque-speed line is known."""
+    entry = motor_entry(name)
+    if entry.line is None:
+        return Drive.from_motor_parameters(entry.parameters)
+    max_torque = math.inf if entry.line.max_torque is None else entry.line.max_torque
+    source = TorqueSpeed(entry.line.stall_torque, entry.line.no_load_speed, max_torque)
+    # The dataclass is frozen, and the reason is not a field.
+    vars(source)["_assumed"] = (
+        "assumed: a torque-speed line without winding, current loop and heating, because"
+        f" {entry.line.reason}"
+    )
+    return source
 
 
 # YAML has no schema: the value may be of any type.

@@ -72,6 +72,14 @@ class TorqueSpeed(ActuatorModel):
         return self.stall_torque / self.no_load_speed
 
     @property
+    def assumed(self) -> str:
+        """Reason for which a datasheet gives no winding; empty for an actuator made otherwise.
+
+        It is not a field: equality, mappings and hashes of configurations ignore it.
+        """
+        return str(vars(self).get("_assumed", ""))
+
+    @property
     def closes_loops(self) -> bool:
         """True: on the line, the torque depends on the speed."""
         return True

@@ -12,6 +12,7 @@ import tyro
 from codrl_mj.actuators import ActuatorModel, Drive, TorqueSpeed, resolve
 from codrl_mj.arrays.written_losses import LostField, WrittenComparison
 from codrl_mj.boundary import Argument
+from codrl_mj.catalogue import MotorEntry, TorqueSpeedLine, joint_names
 from codrl_mj.cli.parsing import AsJson, Output
 from codrl_mj.cli.terminal import format_number, print_table, print_text
 from codrl_mj.fields import command
@@ -126,10 +127,12 @@ class List:
         print_text(
             "at: nominal voltage, or 24 V if the datasheet has none. –: not on the datasheet."
         )
+        joints = joint_names()
+        print_table("Known only by a torque-speed line", ("name",), [(name,) for name in joints])
         print("codrl-mj motor show NAME gives the source of each number")
         specs = {name: QUANTITY_SPECS.get(PRINTED_NAMES.get(name, name)) for name in rows[0]}
         units = LIMIT_UNITS | {name: spec.unit for name, spec in specs.items() if spec is not None}
-        return 0, {"units": units, "motors": rows}
+        return 0, {"units": units, "motors": rows, "torque_speed_lines": joints}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +142,8 @@ class Show:
     The diagram shows the voltage limit (torque falls with speed, because the back-EMF uses up a
     part of the voltage), the peak current and the continuous current, at the output of the gear and
     with friction subtracted. It covers all four quadrants, both driving and braking. The shaded
-    area is available for short times only.
+    area is available for short times only. A motor known only by its torque-speed line has a table
+    of this line, and no diagram.
 
     Example: codrl-mj motor show maxon-ec45-flat-50w --gear-ratio 12 --out motor
     """
@@ -156,7 +160,14 @@ class Show:
         """Print the tables and draw the diagram."""
         from codrl_mj.sizing import describe_motor, find_entry, find_loop
 
-        drive, entry = self.changes.drive(self.name), find_entry(self.name)
+        entry = find_entry(self.name)
+        line = None if entry is None else entry.line
+        # Without a winding there is no diagram, no loop and nothing to change: naming the drive
+        # says so.
+        is_plain = self.out is None and self.html is None and self.changes == Changes()
+        if entry is not None and line is not None and is_plain:
+            return _print_line(entry, line)
+        drive = self.changes.drive(self.name)
         explanation = describe_motor(drive, entry, find_loop(self.name))
         if self.out is not None:
             from codrl_mj.viz.pages.diagrams import torque_speed_diagram
@@ -173,6 +184,36 @@ class Show:
         if self.out is not None:
             save_plot(figure, self.out / "torque_speed.png")
         return 0, explanation
+
+
+def _print_line(entry: MotorEntry, line: TorqueSpeedLine) -> Output:
+    """Print the torque-speed line of a motor without a winding, its notes and its sources."""
+    limit = line.stall_torque if line.max_torque is None else line.max_torque
+    torque = min(limit, line.stall_torque / 2.0)
+    power = torque * line.no_load_speed * (1.0 - torque / line.stall_torque)
+    values = {
+        "power": (power, "W"),
+        "max_torque": (limit, "N*m"),
+        "stall_torque": (line.stall_torque, "N*m"),
+        "no_load_speed": (line.no_load_speed, "rad/s"),
+    }
+    rows = [(name, format_number(value, 4), unit) for name, (value, unit) in values.items()]
+    print_text(f"{entry.name}: {entry.title}")
+    print_table("At the output", ("number", "value", "unit"), rows, right=("value",))
+    print_text(
+        f"simulated by this line, without winding, current loop and heating: {line.reason}",
+        *([f"note: {' '.join(entry.notes.split())}"] if entry.notes else []),
+        *(f"estimated: {field}: {why}" for field, why in entry.estimated.items()),
+        *(f"source: {source}" for source in dict.fromkeys(entry.sources.values())),
+    )
+    return 0, {
+        "units": {name: unit for name, (_, unit) in values.items()},
+        **{name: value for name, (value, _) in values.items()},
+        "reason": line.reason,
+        "notes": entry.notes,
+        "estimated": dict(entry.estimated),
+        "sources": dict(entry.sources),
+    }
 
 
 def _print_explanation(title: str, volts: float, explanation: MotorReport) -> None:

@@ -25,7 +25,13 @@ from codrl_mj.actuators import (
     override_actuator,
     resolve,
 )
-from codrl_mj.catalogue import MotorEntry, MotorParameters, motor_entry, motor_names
+from codrl_mj.catalogue import (
+    MotorEntry,
+    MotorParameters,
+    joint_names,
+    motor_entry,
+    motor_names,
+)
 from codrl_mj.catalogue.datasheet import QUANTITY_SPECS
 from codrl_mj.catalogue.derivation import PRINTED_NAMES
 from codrl_mj.fields import check_names
@@ -78,7 +84,7 @@ def find_drive(
         raise ValueError(
             f"motor = {name!r}: is not a drive, but of the actuator family {base.family};"
             " name a motor of the catalogue (codrl-mj motor list), a TOML file with a datasheet,"
-            " or an actuator of the family drive"
+            f" or an actuator of the family drive{f' ({base.assumed})' * bool(base.assumed)}"
         )
     overrides = {
         part: {key: value for key, value in fields.items() if value is not None}
@@ -89,7 +95,7 @@ def find_drive(
 
 def find_entry(name: object) -> MotorEntry | None:
     """Return the datasheet behind a name of `find_drive`; None if it has no datasheet."""
-    if isinstance(name, str) and (name in motor_names() or name.endswith(".toml")):
+    if isinstance(name, str) and (name in motor_names() + joint_names() or name.endswith(".toml")):
         return motor_entry(name)
     return None
 

@@ -116,6 +116,22 @@ def test_show_accepts_a_custom_datasheet_and_any_drive(capsys):
     assert "numbers" not in read(capsys, "show", "codrl_mj.actuators:Drive")
 
 
+def test_show_prints_the_line_of_a_motor_without_a_winding(capsys):
+    line = printed_by(capsys, "show", "unitree-go2")
+    parts = ("Unitree Go2", "stall_torque", "36.73", "resistance is not printed", "note", "source")
+    assert sorted(parts, key=line.index) == list(parts)
+    content = read(capsys, "show", "unitree-go2")
+    assert content["max_torque"] == pytest.approx(20.2)
+    # Half of the stall torque at half of the no-load speed is the largest power.
+    assert content["power"] == pytest.approx(20.2 * 1.8182 * 30.0 / 4.0)
+    assert "unitree-go2" in read(capsys, "list")["torque_speed_lines"]
+    for words in (["show", "unitree-go2", "--voltage", "12"], ["design", "unitree-go2"]):
+        assert main(["motor", *words]) == 2
+        message = capsys.readouterr().err
+        assert "family torque_speed" in message
+        assert "resistance is not printed" in message
+
+
 def test_a_file_is_written_filled_in_and_shown(capsys):
     printed_by(capsys, "new", "mine.toml")
     assert main(["motor", "new", "mine.toml"]) == 2
