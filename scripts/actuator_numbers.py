@@ -20,7 +20,7 @@ import numpy as np
 
 import codrl_mj
 from codrl_mj.actuators import NAMED, Drive
-from codrl_mj.catalogue import motor_entry, motor_names
+from codrl_mj.catalogue import joint_names, motor_entry, motor_names
 from codrl_mj.runs.files import atomic_write
 from codrl_mj.sizing import analyze_loop, find_drive, torque_limits
 from codrl_mj.study.bench import BLOCKED_INERTIA, make_bench
@@ -205,10 +205,20 @@ def _motor_line(row: dict[str, str]) -> list[str]:
     ]
 
 
+def _joint_line(name: str) -> list[str]:
+    """Return the row of a motor that is known only by its torque-speed line."""
+    line = motor_entry(name).line
+    assert line is not None
+    peak = line.stall_torque if line.max_torque is None else line.max_torque
+    values = (line.stall_torque, line.no_load_speed, peak)
+    return [f"`{name}`", *map(_number, values)]
+
+
 def page(tables: Mapping[str, list[dict[str, str]]]) -> str:
     """Return the Markdown page, from the rows of the CSV files and the catalogue."""
     tasks, motors = tables["tasks"], tables["motors"]
     heads = ("motor", "V", "gear", "stall [N·m]", "no load [rad/s]", "continuous [N·m]")
+    joint_heads = ("motor", "stall [N·m]", "no load [rad/s]", "largest [N·m]")
     actuator_names = [f"`{name}`" for name in dict.fromkeys(row["actuator"] for row in tasks)]
     paper = {
         "settling time to within 2 % [s]": "settled_2_s",
@@ -242,7 +252,14 @@ winding is cold, and the current is not limited. With a current loop at 20 kHz (
 Torques are net torques at the output, after friction. The *continuous* torque belongs to the
 largest current that the winding can carry continuously. A "t" after the name marks motors with
 thermal values. A "–" marks values that the datasheet does not print. Stall torque and no-load
-speed are measured in simulation and agree with the printed values within 5 %.
+speed are measured in simulation and agree with the printed values within 5 %, except where
+`codrl-mj motor show NAME` lists a larger contradiction within the datasheet.
+
+## Motors without a winding
+
+Of these, only a [torque-speed line](motors.md#without-a-winding) is published, at the output:
+
+{_table(joint_heads, map(_joint_line, joint_names()))}
 
 `codrl-mj motor show NAME` prints the source of every value and contradictions in the datasheet.
 """

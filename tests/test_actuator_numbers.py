@@ -107,7 +107,10 @@ def test_a_motors_row_agrees_with_closed_forms():
 
 @pytest.mark.parametrize("name", motor_names())
 def test_every_motor_of_the_catalogue_agrees_with_its_datasheet_in_the_engine(name):
-    """The datasheet's values hold to 5 %, values from its constants to 0.2 %."""
+    """The datasheet's values hold to 5 %, values from its constants to 0.2 %.
+
+    A datasheet that contradicts itself by more is simulated with one of the two values.
+    """
     entry, row = motor_entry(name), SCRIPT.motor_row(name)
     check_row(next(row for row in read_table("motors") if row["motor"] == name), row)
     numbers, printed = entry.parameters, entry.datasheet.parsed_values()
@@ -136,4 +139,5 @@ def test_every_motor_of_the_catalogue_agrees_with_its_datasheet_in_the_engine(na
         at_output = (
             printed[field].value * (ratio if field == "stall_torque" else 1.0 / ratio) ** at_motor
         )
-        assert measured[field] == pytest.approx(at_output, rel=0.05), field
+        accuracy = max([0.05, *(abs(d.difference) for d in numbers.disagreements)])
+        assert measured[field] == pytest.approx(at_output, rel=accuracy), field

@@ -8,19 +8,34 @@ import numpy as np
 import pytest
 from gym_electric_motor.physical_systems.electric_motors import DcPermanentlyExcitedMotor
 
-from codrl_mj.catalogue import motor_entry, motor_names
+from codrl_mj.actuators import Drive, TorqueSpeed, resolve
+from codrl_mj.catalogue import joint_names, motor_entry, motor_names
 from codrl_mj.catalogue.datasheet import QUANTITY_SPECS, Datasheet
 
 NAMES = motor_names()
+JOINTS = joint_names()
 EXPLAINED = {  # disagreements above 5 % -> explanation in the notes
     ("cubemars-ak80-6", "speed_constant"): "5 % off the back-EMF",
     ("cubemars-ak80-6", "no_load_speed"): "the speed at 24 V follows the former",
+    ("cubemars-ak80-9", "no_load_speed"): "6 % slower",
+    ("damiao-j4310", "no_load_speed"): "5 % above",
+    ("damiao-j4340", "no_load_speed"): "7 % below",
+    ("damiao-j8009p", "no_load_speed"): "6 % below",
     ("frc-cim", "torque_constant"): "12 % below the back-EMF constant",
     ("heinzmann-pmg-132", "continuous_speed"): "18 % more",
     ("maxon-ec45-flat-50w", "continuous_speed"): "11 % more",
     ("maxon-ec45-flat-50w", "continuous_torque"): "10 % less",
     ("quanser-qube-servo-3", "continuous_speed"): "15 % slower",
     ("rev-neo", "torque_constant"): "27 % above",
+    ("robstride-02", "no_load_speed"): "11 % above",
+    ("robstride-03", "continuous_torque_at_output"): "15 % less",
+    ("robstride-03", "no_load_speed"): "9 % above",
+    ("robstride-03", "torque_constant"): "7 % above",
+    ("robstride-04", "torque_constant"): "17 % below",
+    ("robstride-04", "no_load_speed"): "11 % above",
+    ("robstride-04", "continuous_torque_at_output"): "10 % less",
+    ("xiaomi-cybergear", "continuous_torque_at_output"): "11 % less",
+    ("xiaomi-cybergear", "torque_constant"): "6 % above",
 }
 CUSTOM_FILE = """
 manufacturer = "mine"
@@ -38,7 +53,8 @@ inductance = "measured on another"
 
 
 def test_the_catalogue_has_motors_of_many_kinds():
-    assert len(NAMES) >= 12
+    assert len(NAMES) >= 40
+    assert len(NAMES) + len(JOINTS) == len({*NAMES, *JOINTS}) >= 50
     kinds = {motor_entry(name).kind for name in NAMES}
     assert {
         "brushed",
@@ -49,14 +65,15 @@ def test_the_catalogue_has_motors_of_many_kinds():
     } <= kinds
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", NAMES + JOINTS)
 def test_every_value_has_a_source_or_a_reason(name):
     entry = motor_entry(name)
     printed = {field for field in QUANTITY_SPECS if getattr(entry.datasheet, field) is not None}
     assert entry.sources.keys() | entry.estimated.keys() == printed
     assert not entry.sources.keys() & entry.estimated.keys()
     assert all(len(text) > 20 for text in (*entry.sources.values(), *entry.estimated.values()))
-    assert set(entry.estimated) <= {"inductance", "electrical_time_constant"}
+    inductance = {"inductance", "electrical_time_constant"}
+    assert set(entry.estimated) <= (inductance if name in NAMES else {"stall_torque"})
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -78,6 +95,8 @@ def test_the_model_meets_the_printed_operating_points(name):
     entry = motor_entry(name)
     numbers, printed = entry.parameters, entry.datasheet.parsed_values()
     friction = (numbers.coulomb_friction or 0.0), (numbers.viscous_friction or 0.0)
+    # The notes explain larger disagreements; see above.
+    accuracy = entry.tolerance if (name, "no_load_speed") in EXPLAINED else 0.05
     if {"no_load_speed", "nominal_voltage"} <= printed.keys():
         matrix = [
             [numbers.resistance, numbers.back_emf_constant],
@@ -85,14 +104,14 @@ def test_the_model_meets_the_printed_operating_points(name):
         ]
         _, speed = np.linalg.solve(matrix, [numbers.voltage, friction[0]])
         ratio = numbers.gear_ratio if printed["no_load_speed"].shaft == "output" else 1.0
-        assert speed / ratio == pytest.approx(printed["no_load_speed"].value, rel=0.05)
+        assert speed / ratio == pytest.approx(printed["no_load_speed"].value, rel=accuracy)
     if "stall_torque" in printed:
         past_gear = printed["stall_torque"].shaft == "output"
         current = numbers.voltage / numbers.resistance
         torque = numbers.torque_constant * (
             current - printed["no_load_current"].value if "no_load_current" in printed else current
         )
-        torque *= numbers.gear_ratio * numbers.gear_efficiency if past_gear else 1.0
+        torque *= numbers.gear_ratio * (numbers.gear_efficiency or 1.0) if past_gear else 1.0
         assert torque == pytest.approx(printed["stall_torque"].value, rel=0.05)
     if "mechanical_time_constant" in printed:
         constant = (
@@ -101,6 +120,51 @@ def test_the_model_meets_the_printed_operating_points(name):
             / (numbers.torque_constant * numbers.back_emf_constant)
         )
         assert constant == pytest.approx(printed["mechanical_time_constant"].value, rel=0.05)
+
+
+@pytest.mark.parametrize("name", JOINTS)
+def test_a_motor_without_a_winding_is_its_torque_speed_line(name):
+    entry = motor_entry(name)
+    printed, line = entry.datasheet.parsed_values(), entry.line
+    assert (line.stall_torque, line.no_load_speed) == pytest.approx(
+        (printed["stall_torque"].value, printed["no_load_speed"].value)
+    )
+    actuator = resolve(name, None, "a robot")
+    assert type(actuator) is TorqueSpeed
+    assert (actuator.stall_torque, actuator.no_load_speed) == (
+        line.stall_torque,
+        line.no_load_speed,
+    )
+    assert "resistance is not printed" in actuator.assumed
+    if "peak_torque" in printed:
+        assert actuator.max_torque == printed["peak_torque"].value
+
+
+@pytest.mark.parametrize(
+    ("name", "torque", "speed"),
+    [
+        ("unitree-go2", 20.2, 13.5),
+        ("unitree-n5020-16", 24.8, 30.86),
+        ("unitree-n7520-14", 71.0, 22.63),
+        ("unitree-n7520-22", 111.0, 14.5),
+    ],
+)
+def test_the_line_passes_through_the_published_knee(name, torque, speed):
+    line = motor_entry(name).line
+    assert line.max_torque == torque
+    at_knee = line.stall_torque * (1.0 - speed / line.no_load_speed)
+    assert at_knee == pytest.approx(torque, rel=1e-4)
+
+
+def test_a_file_without_a_winding_trains_as_a_torque_speed_line(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('[datasheet]\nstall_torque = "2 N*m"\nno_load_speed = "10 rad/s"')
+    assert resolve(path, None, "a robot") == TorqueSpeed(2.0, 10.0)
+    text = 'resistance = "2 ohm"\nkt = "0.5 N*m/A"\nvoltage = "12 V"\npeak_torque = "1 N*m"'
+    path.write_text(f"[datasheet]\n{text}")
+    assert resolve(path, None, "a robot") == TorqueSpeed(3.0, 24.0, 1.0)
+    path.write_text(f'[datasheet]\n{text}\ninductance = "1 mH"')
+    assert type(resolve(path, None, "a robot")) is Drive
 
 
 @pytest.mark.parametrize("name", ["faulhaber-1331-006", "maxon-ec45-flat-50w", "maxon-re65"])
@@ -192,16 +256,21 @@ def test_raises_with_the_nearest_name_of_an_unknown_motor():
 def test_the_docs_list_every_motor_and_their_examples_run(tmp_path, capsys):
     docs = Path(__file__).parents[2] / "docs"
     catalogue = (docs / "actuators_in_numbers.md").read_text().partition("## The catalogue")[2]
-    assert re.findall(r"^\| `([\w-]+)`", catalogue, re.M) == NAMES
+    assert re.findall(r"^\| `([\w-]+)`", catalogue, re.M) == NAMES + JOINTS
     page, names = (docs / "motors.md").read_text(), {}
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         if "motor_entry" in block:
             exec(block, names)
     assert "gear_efficiency = stall_torque_at_output" in capsys.readouterr().out
     path, written = tmp_path / "my_motor.toml", re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (line,) = (text for text in written if "without electrical values" in text)
+    written.remove(line)
     for upto in range(1, len(written) + 1):
         path.write_text("".join(written[:upto]))
         assert motor_entry(str(path)).parameters.rotor_inertia == pytest.approx(1.05e-6)
+    path.write_text(line)
+    assert motor_entry(str(path)).line[:3] == pytest.approx((0.22555, 10.472, 0.15691), rel=1e-4)
+    path.write_text("".join(written))
     assert motor_entry(str(path)).sources["stall_torque"] == "a page"
     assert set(motor_entry(str(path)).estimated) == {"inductance"}
 
