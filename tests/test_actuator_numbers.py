@@ -133,11 +133,12 @@ def test_every_motor_of_the_catalogue_agrees_with_its_datasheet_in_the_engine(na
             math.nan if numbers.rotor_inertia is None else numbers.rotor_inertia / damping
         ),
     }
-    assert measured == pytest.approx(expected, rel=2e-3, nan_ok=True)
+    # At first, static friction holds the rotor for a fraction of a 50 us sample.
+    assert measured == pytest.approx(expected, rel=2e-3, abs=1e-5, nan_ok=True)
     for field in measured.keys() & printed.keys():
         at_motor = printed[field].shaft == "motor" and field != "mechanical_time_constant"
         at_output = (
             printed[field].value * (ratio if field == "stall_torque" else 1.0 / ratio) ** at_motor
         )
-        accuracy = max([0.05, *(abs(d.difference) for d in numbers.disagreements)])
+        accuracy = max([0.05, *(2e-3 + abs(d.difference) for d in numbers.disagreements)])
         assert measured[field] == pytest.approx(at_output, rel=accuracy), field
