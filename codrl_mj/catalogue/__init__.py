@@ -9,12 +9,8 @@ from codrl_mj.catalogue.datasheet import (
     motor_names,
     new_motor,
 )
-from codrl_mj.catalogue.derivation import (
-    Disagreement,
-    IncompleteError,
-    MotorParameters,
-    TorqueSpeedLine,
-)
+from codrl_mj.catalogue.derivation import IncompleteError, MotorParameters, TorqueSpeedLine
+from codrl_mj.catalogue.relations import Disagreement
 
 __all__ = [
     "Datasheet",

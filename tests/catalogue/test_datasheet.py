@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from codrl_mj.catalogue import Datasheet, derivation, from_datasheet, motor_entry, units
+from codrl_mj.catalogue import Datasheet, from_datasheet, motor_entry, relations, units
 from codrl_mj.catalogue.datasheet import QUANTITY_SPECS, to_field_names
 
 UNITS = {  # SI value of one unit, by definition
@@ -627,12 +627,12 @@ def test_contradictions_are_only_listed_if_not_strict():
 
 
 def test_the_rules_use_fields_only():
-    for quantity, formula in (*derivation.RULES, *(check[:2] for check in derivation.CHECKS)):
-        assert {quantity, *derivation.compile_formula(formula).co_names} <= {
+    for quantity, formula in (*relations.RULES, *(check[:2] for check in relations.CHECKS)):
+        assert {quantity, *relations.compile_formula(formula).co_names} <= {
             *QUANTITY_SPECS,
-            *derivation.AT_OUTPUT,
+            *relations.AT_OUTPUT,
         }, formula
-    first = derivation.compile_formula(derivation.RULES[0][1])
+    first = relations.compile_formula(relations.RULES[0][1])
     assert first.co_names == ("nominal_voltage", "stall_current")
     assert eval(first, {}, {"nominal_voltage": 12.0, "stall_current": 133.0}) == 12.0 / 133.0
 
