@@ -81,10 +81,11 @@ def find_drive(
     if isinstance(base, Servo):
         base = override_actuator(base, {"family": Drive.family})
     if type(base) is not Drive:
+        reason = f" ({base.assumed})" if base.assumed else ""
         raise ValueError(
-            f"motor = {name!r}: is not a drive, but of the actuator family {base.family};"
+            f"motor = {name!r}: is not a drive, but of the actuator family {base.family}{reason};"
             " name a motor of the catalogue (codrl-mj motor list), a TOML file with a datasheet,"
-            f" or an actuator of the family drive{f' ({base.assumed})' * bool(base.assumed)}"
+            " or an actuator of the family drive"
         )
     overrides = {
         part: {key: value for key, value in fields.items() if value is not None}
