@@ -53,6 +53,7 @@ from codrl_mj.actuators.parameters import (
 )
 from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
+from codrl_mj.actuators.servo_friction import ServoFriction
 from codrl_mj.actuators.stability import check_stable, spectral_radii, spectral_radius
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 from codrl_mj.user_code import allow_imports
@@ -78,6 +79,7 @@ __all__ = [
     "Empty",
     "SampledLoop",
     "Servo",
+    "ServoFriction",
     "ServoLoop",
     "Supply",
     "TorqueSpeed",

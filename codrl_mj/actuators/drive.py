@@ -26,8 +26,9 @@ from codrl_mj.actuators.model import (
     JointAdditions,
     UnstableError,
 )
-from codrl_mj.actuators.parameters import Parameters, parameters_type
+from codrl_mj.actuators.parameters import FieldValue, Parameters, parameters_type
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
+from codrl_mj.actuators.servo_friction import ServoFriction, has_servo_friction
 from codrl_mj.actuators.shaft import Shaft, StepAverages, TemperatureRises, Winding
 from codrl_mj.catalogue import MotorParameters
 from codrl_mj.fields import optional_nested
@@ -232,6 +233,22 @@ class Drive(ActuatorModel):
     """The current loop."""
     supply: Supply | None = optional_nested(Supply(voltage=24.0))
     """Supply of the drive; None: 24 V without a resistance."""
+    friction: ServoFriction | None = optional_nested(ServoFriction(), kw_only=True)
+    """Friction that depends on speed and load; None: only that of the motor's fields."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        super().__post_init__()
+        # With both, the load on the gear would include the joint's own friction.
+        if self.friction in (None, ServoFriction()):
+            return
+        for name, neutral in _REPLACED_BY_FRICTION.items():
+            if (value := getattr(self.motor, name)) != neutral:
+                raise ValueError(
+                    f"motor.{name} = {value:g}: must be {neutral:g} if friction is set, which"
+                    " describes all friction at the output shaft: move the value to friction.base,"
+                    " viscous, stribeck or load_motor, or remove friction"
+                )
 
     @classmethod
     def from_motor_parameters(cls, parameters: MotorParameters) -> "Drive":
@@ -308,6 +325,14 @@ class Drive(ActuatorModel):
         )
         return f"assumed, because not specified: {assumptions}" if assumptions else ""
 
+    def as_mapping(self) -> dict[str, FieldValue]:
+        """Return the fields, without `friction` if that is None; see `ActuatorModel.as_mapping`."""
+        mapping = super().as_mapping()
+        # Runs are named by a hash of their mapping. Runs without this part keep their names.
+        if self.friction is None:
+            del mapping["friction"]
+        return mapping
+
     @classmethod
     def from_parameter_values(
         cls, parameter_values: Iterable[float], arm_radius: float = 1.0
@@ -325,7 +350,9 @@ class Drive(ActuatorModel):
         fixed = dict.fromkeys(
             ("motor.torque_constant", *ARM_FIELDS), "it would change what an action means"
         )
-        voltage_drive = VoltageDrive(self.motor, self.controller, self.supply)
+        voltage_drive = VoltageDrive(
+            self.motor, self.controller, self.supply, friction=self.friction
+        )
         bypassed = [
             "motor.max_temperature",
             *(f"controller.{name}" for name in _BYPASSED_BY_VOLTAGE),
@@ -437,9 +464,18 @@ class Drive(ActuatorModel):
             columns.thermal_resistance_winding + columns.thermal_resistance_housing > 0.0
         )
         valid &= 1.0 + columns.resistance_coefficient * (columns.ambient_temperature - 25.0) > 0.0
+        for name, neutral in _REPLACED_BY_FRICTION.items():
+            valid &= ~has_servo_friction(columns) | (getattr(columns, name) == neutral)
         return np.where(valid, _radii(cls, parameter_values), np.inf)
 
 
+_REPLACED_BY_FRICTION = {
+    "coulomb_friction": 0.0,
+    "viscous_friction": 0.0,
+    "stribeck_friction": 0.0,
+    "gear_efficiency": 1.0,
+}
+"""Fields of the motor that the part `friction` replaces, with their values without friction."""
 ARM_FIELDS = ("motor.gear_ratio", "motor.arm_radius")
 """Fields that determine how a torque at the rotor acts on the joint."""
 _BYPASSED_BY_VOLTAGE = ("bandwidth", "kp", "ki", "anti_windup", "bemf_compensation", "max_current")

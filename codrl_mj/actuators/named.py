@@ -164,10 +164,10 @@ def named_mapping(actuator: ActuatorModel) -> dict[str, FieldValue] | None:
         base = resolve(name, None, "a motor").as_mapping()
         changes = {
             part: {
-                key: value for key, value in inner.items() if value != (base[part] or {}).get(key)
+                key: value for key, value in inner.items() if value != (base.get(part) or {}).get(key)
             }
             for part, inner in mapping.items()
-            if inner and inner != base[part]
+            if inner and inner != base.get(part)
         }
         if resolve(candidate := {"name": name, **changes}, None, "a motor") == actuator:
             return candidate
