@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard, TypeVar
 
+from codrl_mj.actuators.bam import bam_name, from_bam, is_bam
 from codrl_mj.actuators.current_loop import CurrentLoop, DCMotorActuator
 from codrl_mj.actuators.drive import Drive
 from codrl_mj.actuators.gear_motor import GearMotor
@@ -181,8 +182,8 @@ def resolve(actuator: ActuatorSetting, paper: DCMotorActuator | None, owner: str
         actuator: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file,
             `module:NAME` of an actuator or a family, an actuator, a family's class, a mapping of an
             actuator's fields (with a `name`: changes to that actuator; with a `label`: its display
-            name), a YAML or JSON file with such a mapping, or None (ideal). Files may be given as a
-            `pathlib.Path`.
+            name), a YAML or JSON file with such a mapping, a JSON file of BAM, or None (ideal). Files
+            may be given as a `pathlib.Path`.
         paper: the actuator that the names in `NAMED` vary; None if there is none.
         owner: description of the task or environment that gets the actuator, for messages.
 
@@ -306,6 +307,8 @@ def _from_file(path: Path, paper: DCMotorActuator | None, owner: str) -> Actuato
                 f"name = {fields['name']!r}: must be an actuator's name, or a file that does not"
                 " name another file"
             )
+        if is_bam(fields):
+            return set_display_name(from_bam(fields), bam_name(fields))
         with allow_imports_from_files():
             actuator = resolve(fields, paper, owner)
     except (ValueError, TypeError) as error:

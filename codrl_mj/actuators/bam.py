@@ -1,0 +1,184 @@
+"""Servos in the JSON files of BAM (Better Actuator Models, github.com/Rhoban/bam).
+
+BAM's numbers are those of the output shaft: a winding without inductance and gear, and one of six
+models of friction. Its firmware computes the voltage g*(q* - q), where g is the product of voltage,
+`error_gain` and position gain. The torque kT/R*(g*(q* - q) - kT*w) is that of a `servo` with the
+velocity gain kT^2/R and the position gain g/kT, as long as the voltage suffices, and the same
+voltage limits it.
+"""
+
+import math
+import warnings
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from codrl_mj.actuators.current_loop import Supply
+from codrl_mj.actuators.drive import Drive
+from codrl_mj.actuators.gear_motor import GearMotor
+from codrl_mj.actuators.parameters import FieldValue
+from codrl_mj.actuators.sampled_loop import SampledLoop
+from codrl_mj.actuators.servo import Servo, ServoLoop
+from codrl_mj.actuators.servo_friction import ServoFriction
+from codrl_mj.fields import check_names
+
+ELECTRICAL_TIME_CONSTANT = 1e-4
+"""Time constant [s] of the winding, which BAM leaves out: well below a step of simulations."""
+
+
+class ServoLaw(NamedTuple):
+    """Numbers of a servo's firmware and supply that BAM's package sets, and its files do not."""
+
+    voltage: float
+    """Supply voltage [V]."""
+    gain: float | None
+    """Position gain as the firmware's number; None: current-controlled, with a gain in each log."""
+    error_gain: float = 1.0
+    """Duty for a position error of 1 rad and a gain of 1."""
+    max_duty: float = 1.0
+    """Largest duty."""
+    max_current: float = math.inf
+    """Largest current [A]."""
+
+
+_MX = ServoLaw(15.0, 32.0, 0.158, 0.9625)
+_EROB = ServoLaw(48.0, None, max_current=12.0)
+# 4,096 counts a turn; the firmware divides by 256, and its full duty is 885.
+_XL330_GAIN = 4096.0 / (2.0 * math.pi) / (256.0 * 885.0)
+LAWS = {
+    "mx64": _MX,
+    "mx106": _MX,
+    "xl320": ServoLaw(7.5, 32.0, 0.05048199),
+    "xl330": ServoLaw(7.5, 400.0, _XL330_GAIN, max_current=1.75),
+    "sts3215": ServoLaw(7.4, 32.0, 0.166, 0.97),
+    "erob80_100": _EROB,
+    "erob80_50": _EROB,
+}
+"""Name of an actuator in BAM -> its law, from `better-actuator-models` 1.0.2 (Apache-2.0)."""
+_LAW_KEYS = {"vin": "voltage", "kp": "gain", "error_gain": "error_gain", "max_pwm": "max_duty"}
+"""Keys of a file that replace a number of the law -> its name in `ServoLaw`."""
+_FRICTION_KEYS = {
+    "friction_base": ("base",),
+    "friction_viscous": ("viscous",),
+    "friction_stribeck": ("stribeck",),
+    "dtheta_stribeck": ("stribeck_speed",),
+    "alpha": ("stribeck_exponent",),
+    "load_friction_base": ("load_motor", "load_external"),
+    "load_friction_stribeck": ("load_motor_stribeck", "load_external_stribeck"),
+    "load_friction_motor": ("load_motor",),
+    "load_friction_external": ("load_external",),
+    "load_friction_motor_stribeck": ("load_motor_stribeck",),
+    "load_friction_external_stribeck": ("load_external_stribeck",),
+    "load_friction_motor_quad": ("load_motor_quadratic",),
+    "load_friction_external_quad": ("load_external_quadratic",),
+}
+"""Keys of BAM's friction -> fields of `ServoFriction`.
+
+The models M3 and M4 have one number for motor and load, which both fields get.
+"""
+_STRIBECK = ("friction_stribeck", "dtheta_stribeck", "alpha")
+_DIRECTIONAL = ("load_friction_motor", "load_friction_external")
+_M5 = (*_STRIBECK, *_DIRECTIONAL, *(f"{name}_stribeck" for name in _DIRECTIONAL))
+_MODELS = {
+    "m1": (),
+    "m2": _STRIBECK,
+    "m3": ("load_friction_base",),
+    "m4": (*_STRIBECK, "load_friction_base", "load_friction_stribeck"),
+    "m5": _M5,
+    "m6": (*_M5, *(f"{name}_quad" for name in _DIRECTIONAL)),
+}
+"""Model -> its numbers, besides the two of `m1`, which all have."""
+_UNUSED = {
+    "command_delay": "set the delay of commands in the environment (disturbances.command_delay)",
+    "max_velocity": "let the commands move no faster",
+}
+"""Numbers of the firmware that a servo has no field for, with the remedy."""
+_OTHERS = ("model", "actuator", "kt", "R", "armature", "q_offset", "error_gain_ratio")
+
+
+def is_bam(mapping: Mapping[str, FieldValue]) -> bool:
+    """Return True if a file's mapping is one of BAM's, by its keys."""
+    return {"model", "actuator"} <= mapping.keys() and "family" not in mapping
+
+
+def bam_name(mapping: Mapping[str, FieldValue]) -> str:
+    """Return a display name: actuator and model of friction."""
+    return f"{mapping['actuator']}-{mapping['model']}"
+
+
+def friction_from_bam(mapping: Mapping[str, FieldValue]) -> ServoFriction:
+    """Return the friction of a file of BAM.
+
+    Raises:
+        ValueError: the model is unknown, or one of its numbers is missing or out of bounds.
+    """
+    check_names([mapping["model"]], _MODELS, "model of friction")
+    keys = ("friction_base", "friction_viscous", *_MODELS[mapping["model"]])
+    if missing := [key for key in keys if key not in mapping]:
+        raise ValueError(f"model {mapping['model']!r}: needs {', '.join(missing)}")
+    return ServoFriction(**{field: mapping[key] for key in keys for field in _FRICTION_KEYS[key]})
+
+
+def bam_friction(friction: ServoFriction) -> dict[str, str | float]:
+    """Return friction as BAM writes it: `model`, the first of the six that suffices, and numbers."""
+    values = vars(friction)
+
+    def is_exact(model: str) -> bool:
+        """Return True if the model's keys give back all numbers that have an effect."""
+        read: dict[str, float] = {}
+        for key in ("friction_base", "friction_viscous", *_MODELS[model]):
+            read |= {field: values[_FRICTION_KEYS[key][0]] for field in _FRICTION_KEYS[key]}
+        shape = ("stribeck_speed", "stribeck_exponent")
+        return all(read.get(name, 0.0) == value for name, value in values.items() if name not in shape)
+
+    model = next(model for model in _MODELS if is_exact(model))
+    keys = ("friction_base", "friction_viscous", *_MODELS[model])
+    return {"model": model} | {key: values[_FRICTION_KEYS[key][0]] for key in keys}
+
+
+def from_bam(mapping: Mapping[str, FieldValue]) -> Drive:
+    """Return the servo of a file of BAM; a drive if the file names no position gain.
+
+    `q_offset` belongs to the bench of the logs and is ignored.
+
+    Args:
+        mapping: content of the file. Besides BAM's own keys it may have `vin` [V], `kp`,
+            `error_gain` and `max_pwm`, which replace the values of BAM's package.
+
+    Raises:
+        ValueError: the actuator has no winding or is unknown, or a number is missing, unknown or
+            out of bounds.
+    """
+    known = (*_OTHERS, *_LAW_KEYS, *_UNUSED, *_FRICTION_KEYS)
+    check_names(mapping, known, "number of BAM's file")
+    check_names([mapping["actuator"]], LAWS, "actuator of BAM", list_all=True)
+    if missing := [key for key in ("kt", "R", "armature") if key not in mapping]:
+        raise ValueError(
+            f"{', '.join(missing)}: missing in BAM's file, whose package would take the value at"
+            " which its fit starts; add it, for example R = 2 ohm for an eRob"
+        )
+    law = LAWS[mapping["actuator"]]._replace(
+        **{name: mapping[key] for key, name in _LAW_KEYS.items() if key in mapping}
+    )
+    constant, resistance = mapping["kt"], mapping["R"]
+    motor = GearMotor(
+        resistance=resistance,
+        inductance=ELECTRICAL_TIME_CONSTANT * resistance,
+        torque_constant=constant,
+        back_emf_constant=constant,
+        rotor_inertia=mapping["armature"],
+    )
+    parts = motor, SampledLoop(max_current=law.max_current), Supply(law.voltage * law.max_duty)
+    friction = friction_from_bam(mapping)
+    for name in _UNUSED.keys() & mapping.keys():
+        if mapping[name]:
+            warnings.warn(
+                f"{name} = {mapping[name]:g} of BAM's file: a servo has no such field: {_UNUSED[name]}",
+                stacklevel=2,
+            )
+    if law.gain is None:
+        return Drive(*parts, friction=friction)
+    volts_per_radian = law.voltage * law.gain * law.error_gain * mapping.get("error_gain_ratio", 1.0)
+    loop = ServoLoop(
+        position_gain=volts_per_radian / constant, velocity_gain=constant * constant / resistance
+    )
+    return Servo(*parts, loop, friction=friction)
