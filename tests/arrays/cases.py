@@ -141,9 +141,35 @@ def loop_columns(draw, motor):
     }
 
 
+def friction_columns(draw, torque):
+    """Return parameters of the friction of servos, for a torque [N*m] at the output."""
+    shares = ("load_motor", "load_external", "load_motor_stribeck", "load_external_stribeck")
+    columns = {
+        "base": draw.sometimes(0.7, torque * draw.log(1e-3, 0.2)),
+        "viscous": draw.sometimes(0.5, torque * draw.log(1e-5, 1e-3)),
+        "stribeck": draw.sometimes(0.5, torque * draw.log(1e-3, 0.2)),
+        "stribeck_speed": draw.log(0.1, 10),
+        "stribeck_exponent": draw.uniform(0.5, 5),
+        **{name: draw.sometimes(0.6, draw.uniform(0.0, 0.4)) for name in shares},
+        "load_motor_quadratic": draw.sometimes(0.5, draw.uniform(0.0, 0.1) / torque),
+        "load_external_quadratic": draw.sometimes(0.5, draw.uniform(0.0, 0.1) / torque),
+    }
+    return {f"friction_{name}": values for name, values in columns.items()}
+
+
+def with_servo_friction(draw, p):
+    """Return parameters of which a third have the friction of servos instead of the motor's."""
+    torque = p["supply_voltage"] / p["resistance"] * p["torque_constant"] * p["gear_ratio"]
+    is_servo = draw.rng.random(draw.n) < 0.33
+    without = dict.fromkeys(("coulomb_friction", "viscous_friction", "stribeck_friction"), 0.0)
+    without |= {"gear_efficiency": 1.0}
+    changed = without | friction_columns(draw, torque)
+    return p | {name: np.where(is_servo, values, p[name]) for name, values in changed.items()}
+
+
 def drive_case(draw, family=Drive, timestep=0.002):
     n, motor = draw.n, motor_columns(draw)
-    p = defaults(family, n) | motor | loop_columns(draw, motor)
+    p = with_servo_friction(draw, defaults(family, n) | motor | loop_columns(draw, motor))
     stall, kt, voltage = (
         p["supply_voltage"] / p["resistance"],
         motor["torque_constant"],

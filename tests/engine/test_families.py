@@ -17,6 +17,7 @@ from codrl_mj.actuators import (
     Lag,
     SampledLoop,
     Servo,
+    ServoFriction,
     ServoLoop,
     Supply,
     TorqueSpeed,
@@ -172,6 +173,12 @@ ALL = [
         ),
         SampledLoop(10e3, deadband=0.1, max_current=0.3),
         Supply(2.0),
+    ),
+    Drive(
+        GearMotor(torque_constant=0.5, gear_ratio=2.0),
+        SampledLoop(10e3),
+        Supply(2.0),
+        friction=ServoFriction(0.02, 0.01, 0.03, 0.5, 1.3, 0.2, 0.1, 0.05, 0.1, 0.02, 0.03),
     ),
     Drive(GearMotor(torque_constant=0.5), SampledLoop(10e3), Supply(2.0))
     .commands()["voltage"]
