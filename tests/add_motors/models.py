@@ -102,7 +102,7 @@ ACTUATORS = {
         ServoLoop(position_gain=2.0, velocity_gain=0.5, velocity_integral_gain=0.1),
     ),
     "servo_friction": Drive(
-        GearMotor(gear_ratio=5.0),
+        GearMotor(rotor_inertia=0.0, gear_ratio=5.0),
         SampledLoop(10e3),
         Supply(3.0),
         friction=ServoFriction(0.01, 0.01, 0.02, 0.5, 1.3, 0.2, 0.1, 0.05, 0.1, 0.02, 0.03),
