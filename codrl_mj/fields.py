@@ -372,14 +372,9 @@ def build(cls: type[Kind], mapping: object, label: str, prefix: str = "") -> Kin
     return cls(**{key: convert(key, value) for key, value in mapping.items()})
 
 
-def optional_nested(absent: object, kw_only: bool = False) -> DeclaredField:
-    """Return a field for an optional nested dataclass; None, the default, stands for `absent`.
-
-    Args:
-        absent: part that None stands for.
-        kw_only: the constructor takes the field by its name only, so that positions of others stay.
-    """
-    return dataclasses.field(default=None, metadata={"absent": absent}, kw_only=kw_only)
+def optional_nested(absent: object) -> DeclaredField:
+    """Return a field for an optional nested dataclass; None, the default, stands for `absent`."""
+    return dataclasses.field(default=None, metadata={"absent": absent})
 
 
 def nested_types(cls: type) -> dict[str, type]:

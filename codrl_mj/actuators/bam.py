@@ -119,16 +119,18 @@ def friction_from_bam(mapping: Mapping[str, FieldValue]) -> ServoFriction:
 
 
 def bam_friction(friction: ServoFriction) -> dict[str, str | float]:
-    """Return friction as BAM writes it: `model`, the first of the six that suffices, and numbers."""
+    """Return friction as BAM writes it: the first `model` of the six that suffices, and numbers."""
     values = vars(friction)
 
     def is_exact(model: str) -> bool:
         """Return True if the model's keys give back all numbers that have an effect."""
         read: dict[str, float] = {}
         for key in ("friction_base", "friction_viscous", *_MODELS[model]):
-            read |= {field: values[_FRICTION_KEYS[key][0]] for field in _FRICTION_KEYS[key]}
+            read |= dict.fromkeys(_FRICTION_KEYS[key], values[_FRICTION_KEYS[key][0]])
         shape = ("stribeck_speed", "stribeck_exponent")
-        return all(read.get(name, 0.0) == value for name, value in values.items() if name not in shape)
+        return all(
+            read.get(name, 0.0) == value for name, value in values.items() if name not in shape
+        )
 
     model = next(model for model in _MODELS if is_exact(model))
     keys = ("friction_base", "friction_viscous", *_MODELS[model])
@@ -172,12 +174,15 @@ def from_bam(mapping: Mapping[str, FieldValue]) -> Drive:
     for name in _UNUSED.keys() & mapping.keys():
         if mapping[name]:
             warnings.warn(
-                f"{name} = {mapping[name]:g} of BAM's file: a servo has no such field: {_UNUSED[name]}",
+                f"{name} = {mapping[name]:g} in BAM's file has no field in a servo:"
+                f" {_UNUSED[name]}",
                 stacklevel=2,
             )
     if law.gain is None:
         return Drive(*parts, friction=friction)
-    volts_per_radian = law.voltage * law.gain * law.error_gain * mapping.get("error_gain_ratio", 1.0)
+    volts_per_radian = (
+        law.voltage * law.gain * law.error_gain * mapping.get("error_gain_ratio", 1.0)
+    )
     loop = ServoLoop(
         position_gain=volts_per_radian / constant, velocity_gain=constant * constant / resistance
     )

@@ -11,7 +11,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self, cast
 
 import numpy as np
 
@@ -233,7 +233,10 @@ class Drive(ActuatorModel):
     """The current loop."""
     supply: Supply | None = optional_nested(Supply(voltage=24.0))
     """Supply of the drive; None: 24 V without a resistance."""
-    friction: ServoFriction | None = optional_nested(ServoFriction(), kw_only=True)
+    # As `fields.optional_nested`, but taken by its name only, so that the positions of others stay.
+    friction: ServoFriction | None = dataclasses.field(
+        default=None, kw_only=True, metadata={"absent": ServoFriction()}
+    )
     """Friction that depends on speed and load; None: only that of the motor's fields."""
 
     def __post_init__(self) -> None:
@@ -275,6 +278,12 @@ class Drive(ActuatorModel):
             motor.viscous_friction / (arm * arm),
             motor.coulomb_friction / arm,
         )
+
+    @property
+    def delivered_friction(self) -> JointAdditions:
+        """Constant parts of `friction`; see `ActuatorModel.delivered_friction`."""
+        friction, arm = self.friction or ServoFriction(), self.motor.arm_radius
+        return JointAdditions(0.0, friction.viscous / (arm * arm), friction.base / arm)
 
     @property
     def back_emf_damping(self) -> float:
@@ -464,8 +473,10 @@ class Drive(ActuatorModel):
             columns.thermal_resistance_winding + columns.thermal_resistance_housing > 0.0
         )
         valid &= 1.0 + columns.resistance_coefficient * (columns.ambient_temperature - 25.0) > 0.0
+        # The function is written for numbers, and computes with arrays here.
+        has_friction = np.asarray(has_servo_friction(cast(Parameters, columns)))
         for name, neutral in _REPLACED_BY_FRICTION.items():
-            valid &= ~has_servo_friction(columns) | (getattr(columns, name) == neutral)
+            valid &= ~has_friction | (getattr(columns, name) == neutral)
         return np.where(valid, _radii(cls, parameter_values), np.inf)
 
 

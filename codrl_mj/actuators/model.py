@@ -213,6 +213,11 @@ class ActuatorModel(fields.Checked):
         return JointAdditions()
 
     @property
+    def delivered_friction(self) -> JointAdditions:
+        """Viscous and Coulomb friction at the joint that the delivered torque already contains."""
+        return JointAdditions()
+
+    @property
     def back_emf_damping(self) -> float:
         """Damping [N*m*s/rad] at the joint by the back-EMF: slope of the torque-speed line."""
         return 0.0

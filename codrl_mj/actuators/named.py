@@ -165,7 +165,9 @@ def named_mapping(actuator: ActuatorModel) -> dict[str, FieldValue] | None:
         base = resolve(name, None, "a motor").as_mapping()
         changes = {
             part: {
-                key: value for key, value in inner.items() if value != (base.get(part) or {}).get(key)
+                key: value
+                for key, value in inner.items()
+                if value != (base.get(part) or {}).get(key)
             }
             for part, inner in mapping.items()
             if inner and inner != base.get(part)
@@ -182,8 +184,8 @@ def resolve(actuator: ActuatorSetting, paper: DCMotorActuator | None, owner: str
         actuator: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file,
             `module:NAME` of an actuator or a family, an actuator, a family's class, a mapping of an
             actuator's fields (with a `name`: changes to that actuator; with a `label`: its display
-            name), a YAML or JSON file with such a mapping, a JSON file of BAM, or None (ideal). Files
-            may be given as a `pathlib.Path`.
+            name), a YAML or JSON file with such a mapping or from BAM, or None (ideal). Files may
+            be given as a `pathlib.Path`.
         paper: the actuator that the names in `NAMED` vary; None if there is none.
         owner: description of the task or environment that gets the actuator, for messages.
 

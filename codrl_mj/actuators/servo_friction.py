@@ -27,6 +27,14 @@ from codrl_mj.fields import Checked, real
 _TOLERANCE, _MAX_ITERATIONS = 1e-13, 200
 
 
+LOAD_TERMS = tuple(
+    f"load_{side}{kind}"
+    for kind in ("", "_stribeck", "_quadratic")
+    for side in ("motor", "external")
+)
+"""Fields of `ServoFriction` that depend on torques."""
+
+
 def has_servo_friction(parameters: Parameters) -> bool:
     """Return True if any term of the part `friction` is not 0."""
     constant = parameters.friction_base + parameters.friction_viscous + parameters.friction_stribeck
@@ -146,6 +154,22 @@ class ServoFriction(Checked):
     """Additional friction at standstill for a squared load of 1 (N*m)^2, >= 0, while a stronger
     motor pushes against the load.
     """
+
+    def at_arm(self, radius: float) -> "ServoFriction":
+        """Return the friction as forces and speeds of a slide at a pinion of a radius [m]."""
+        return ServoFriction(
+            self.base / radius,
+            self.viscous / (radius * radius),
+            self.stribeck / radius,
+            self.stribeck_speed * radius,
+            self.stribeck_exponent,
+            self.load_motor,
+            self.load_external,
+            self.load_motor_stribeck,
+            self.load_external_stribeck,
+            self.load_motor_quadratic * radius,
+            self.load_external_quadratic * radius,
+        )
 
     def limit(
         self, speed: np.ndarray, motor_torque: np.ndarray, load_torque: np.ndarray

@@ -141,9 +141,7 @@ def test_a_pendulum_moves_as_in_the_published_simulation(model, gear_ratio):
 
 def test_a_pendulum_moves_otherwise_if_friction_ignores_the_load():
     arguments = (3.0, -0.5, lambda time: 0.9 * math.sin(4.4 * time))
-    complete, plain = (
-        simulated(MODELS[name], 0.001, *arguments) for name in ("m6", "m2")
-    )
+    complete, plain = (simulated(MODELS[name], 0.001, *arguments) for name in ("m6", "m2"))
     assert np.abs(complete - plain).max() > 0.1 * np.ptp(complete)
 
 
@@ -186,7 +184,7 @@ def test_a_pendulum_breaks_loose_and_slides_as_in_an_exact_integration(model):
 def test_a_held_load_does_not_creep():
     """MuJoCo's own friction constraint creeps; this friction comes to rest exactly."""
     friction = dataclasses.replace(MODELS["m6"], base=0.3)
-    angles = simulated(friction, 0.001, 4.0, 0.3, lambda time: 0.05)
+    angles = simulated(friction, 0.001, 4.0, 0.3, lambda _: 0.05)
     assert abs(angles[-1] - angles[1000]) < 1e-12
     assert abs(angles[-1] - 0.3) < 1e-4
 

@@ -235,10 +235,11 @@ def torque_range(
     not subtracted.
     """
     if isinstance(actuator, Drive):
-        no_friction = {
+        no_friction: dict[str, float | None] = {
             f"motor.{name}": 0.0
             for name in ("coulomb_friction", "viscous_friction", "stribeck_friction")
         }
+        no_friction["friction"] = None
         return torque_limits(
             actuator.replaced(no_friction), speeds, actuator.controller.max_current
         )
