@@ -13,7 +13,9 @@ from scipy.optimize import brentq
 import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, ServoFriction, Supply, resolve
 from codrl_mj.envs.single import ActuatedEnv
-from tests.actuators.test_shaft import on_a_shaft
+from codrl_mj.identify.result import base_motor
+from codrl_mj.sizing import drive_limits, operating_points
+from tests.actuators.test_shaft import hinge, on_a_shaft
 
 BASE = {"base": 0.03, "viscous": 0.012}
 STRIBECK = {"stribeck": 0.04, "stribeck_speed": 0.8, "stribeck_exponent": 1.4}
@@ -250,3 +252,37 @@ def test_friction_is_drawn_at_each_reset():
             action = np.array([1.0], np.float32)
             observations.append(env.step(action)[0])
             np.testing.assert_array_equal(fixed.step(action)[0], observations[-1])
+
+
+def test_a_model_whose_joint_has_the_friction_of_its_motor_is_warned_of():
+    """The friction is part of the torque, and adding the joint's own would count it twice."""
+    spec = hinge(0.002)
+    spec.joint("shaft").frictionloss = 0.2
+    drive = Drive(MOTOR, friction=ServoFriction(base=0.1))
+    with pytest.warns(
+        codrl_mj.engine.MotorWarning, match=r"frictionloss 0\.2 \(the motor's is 0\.1\)"
+    ):
+        codrl_mj.add_motors(spec, {"shaft": drive})
+    replaced = codrl_mj.add_motors(spec, {"shaft": drive}, joint_dynamics="replace").compile()
+    assert replaced.dof_frictionloss[0] == 0.0
+
+
+def test_limits_at_the_output_subtract_the_friction():
+    friction = ServoFriction(base=0.1, viscous=0.01, load_motor=0.2, load_external=0.05)
+    motor = GearMotor(resistance=2.0, torque_constant=0.5, back_emf_constant=0.5)
+    limits = drive_limits(Drive(motor, supply=Supply(12.0), friction=friction))
+    # 3 N*m at stall: 3 - 0.1 - 0.2*3 - 0.05*net = net.
+    assert limits.stall_torque == pytest.approx((3.0 - 0.1 - 0.6) / 1.05, rel=1e-9)
+    # Without a load, the motor's torque t balances 0.1 + 0.01*w + 0.2*t.
+    speed = limits.no_load_speed
+    torque = 0.5 * (12.0 - 0.5 * speed) / 2.0
+    assert torque == pytest.approx(0.1 + 0.01 * speed + 0.2 * torque, rel=1e-9)
+    assert limits.no_load_current == pytest.approx(torque / 0.5, rel=1e-9)
+
+
+def test_sizing_and_identification_refuse_this_friction_by_name():
+    drive = Drive(friction=ServoFriction(load_motor=0.2))
+    with pytest.raises(ValueError, match=r"friction: .* remove friction, and set motor.coulomb"):
+        operating_points(None, drive)
+    with pytest.raises(ValueError, match=r"friction: identification estimates .* remove friction"):
+        base_motor(drive.as_mapping())
