@@ -179,8 +179,9 @@ def test_a_pendulum_breaks_loose_and_slides_as_in_an_exact_integration(model):
     expected = np.where(slides, motion.sol(np.maximum(times, loose))[0], start)
     assert expected[-1] - start > 0.01
     # Until it breaks loose it stays, but for the first steps, in which the load is not yet known.
-    assert np.abs(angles[times < loose - 0.01] - start).max() < 1e-4
-    assert np.abs(angles - expected).max() < 0.03 * (expected[-1] - start) + 1e-4
+    assert np.abs(angles[times < loose - 0.01] - start).max() < 1e-5
+    # The rest is the delay of the current loop.
+    assert np.abs(angles - expected).max() < 0.004 * (expected[-1] - start)
 
 
 def test_a_held_load_does_not_creep():
