@@ -51,6 +51,7 @@ from codrl_mj.actuators.parameters import (
     parameter_paths,
     parameters_type,
 )
+from codrl_mj.actuators.pwm_servo import PwmLoop, PwmServo
 from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
 from codrl_mj.actuators.stability import check_stable, spectral_radii, spectral_radius
@@ -76,6 +77,8 @@ __all__ = [
     "Lag",
     "Motor",
     "Empty",
+    "PwmLoop",
+    "PwmServo",
     "SampledLoop",
     "Servo",
     "ServoLoop",
