@@ -16,12 +16,13 @@ import numpy as np
 
 from codrl_mj.actuators import drive, noise, shaft, stability
 from codrl_mj.actuators.current_loop import Supply
+from codrl_mj.actuators.firmware import FIRMWARES, find_firmware
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.geared import Geared
 from codrl_mj.actuators.model import Command, Inputs, UnstableError
 from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.shaft import Shaft, TemperatureRises
-from codrl_mj.fields import Checked, optional_nested, real
+from codrl_mj.fields import Checked, choice, optional_nested, real
 
 HISTORY = 8
 """Number of commands that are on their way at the same time, at most."""
@@ -40,7 +41,22 @@ class PwmLoop(Checked):
     """
 
     position_gain: float = real(5.0, above=0.0, unit="1/rad")
-    """Duty cycle for a position error of 1 rad, > 0; 1 is the whole voltage of the supply."""
+    """Duty cycle for a position error of 1 rad, > 0; 1 is the whole voltage of the supply. If you
+    specify `position_p` or `stiffness`, the servo computes it.
+    """
+    position_p: float = real(0.0, minimum=0.0)
+    """Position gain as the value of the register P of the `firmware`, >= 0. The servo converts it
+    to `position_gain` and sets it to 0.
+    """
+    stiffness: float = real(0.0, minimum=0.0, unit="N*m/rad")
+    """Position gain as the torque [N*m] of the motor at the output for a position error of 1 rad at
+    standstill, without the gear's losses, >= 0. The servo converts it to `position_gain` and sets
+    it to 0.
+    """
+    firmware: str = choice("unknown", "unknown", *FIRMWARES)
+    """Product line of the servo, which tells the meaning of `position_p`. A motor of the catalogue
+    that becomes a servo sets it.
+    """
     integral_gain: float = real(0.0, minimum=0.0, unit="1/(rad*s)")
     """Duty cycle that a position error of 1 rad adds in a second, >= 0. The integral stops while
     the duty cycle is at its limit.
@@ -88,6 +104,23 @@ class PwmLoop(Checked):
             raise ValueError(
                 f"PwmLoop.start_duty = {self.start_duty:g}: must be <= max_duty = {self.max_duty:g}"
             )
+        if self.position_p and self.stiffness:
+            raise ValueError(
+                f"PwmLoop.position_p = {self.position_p:g} and stiffness = {self.stiffness:g}: are"
+                " two values of the same gain; set one of them"
+            )
+        if self.position_p and self.firmware == "unknown":
+            raise ValueError(
+                f"PwmLoop.position_p = {self.position_p:g}: the meaning of this register depends on"
+                f" the product line; set firmware to one of {', '.join(FIRMWARES)}, or specify"
+                " position_gain [duty cycle per rad] or stiffness [N*m/rad] instead"
+            )
+
+    @property
+    def register_p(self) -> float | None:
+        """Value of the register P that gives `position_gain`; None if the firmware is unknown."""
+        law = FIRMWARES.get(self.firmware)
+        return None if law is None else self.position_gain / law.gain_per_p
 
 
 class State(NamedTuple):
@@ -512,21 +545,77 @@ class PwmServo(Geared):
                 "PwmServo.supply.voltage = inf: must be finite, because the duty cycle is a share"
                 " of it"
             )
+        loop, gain = self.loop, 0.0
+        if loop.position_p:
+            gain = loop.position_p * FIRMWARES[loop.firmware].gain_per_p
+        elif loop.stiffness:
+            gain = loop.stiffness / self.stall_torque
+        if gain:
+            # The dataclass is frozen. A single gain remains, so that a later change of another
+            # field, such as a drawn voltage, does not change the servo's law.
+            converted = dataclasses.replace(loop, position_gain=gain, position_p=0.0, stiffness=0.0)
+            vars(self)["loop"] = converted
+
+    @property
+    def stall_torque(self) -> float:
+        """Torque [N*m] of the motor at the output at standstill and a duty cycle of 1.
+
+        It leaves out the gear's losses and the supply's resistance.
+        """
+        motor = self.motor
+        return motor.torque_constant * self.voltage_limit * motor.gear_ratio / motor.resistance
 
     @property
     def stiffness(self) -> float:
-        """Torque [N*m] of the motor at the output for a position error of 1 rad at standstill.
+        """Torque [N*m] of the motor at the output for a position error of 1 rad at standstill."""
+        return self.loop.position_gain * self.stall_torque
 
-        It leaves out the gear's losses and the limit of the duty cycle.
+    @classmethod
+    def factory_settings(
+        cls, motor: str, loop_fields: Mapping[str, object]
+    ) -> dict[str, float | str]:
+        """Return the settings of the loop that a motor's name implies; empty if it implies none.
+
+        Args:
+            motor: name of a motor of the catalogue, or of a file.
+            loop_fields: settings of the loop that the user has specified.
         """
-        motor = self.motor
-        per_duty = motor.torque_constant * self.voltage_limit * motor.gear_ratio / motor.resistance
-        return self.loop.position_gain * per_duty
+        found = find_firmware(motor)
+        name = str(loop_fields.get("firmware", found[0] if found else "unknown"))
+        if name not in FIRMWARES:
+            return {}
+        law = FIRMWARES[name]
+        settings: dict[str, float | str] = {
+            "firmware": name,
+            "max_duty": law.max_duty,
+            "encoder_counts": law.encoder_counts,
+        }
+        is_set = {"position_gain", "position_p", "stiffness"} & loop_fields.keys()
+        if found is not None and found[0] == name and not is_set:
+            settings["position_p"] = found[1]
+        return settings
+
+    @property
+    def assumed(self) -> str:
+        """Unspecified inertia and gain; see `ActuatorModel.assumed`."""
+        missing = {
+            f"supply.voltage = {self.voltage_limit:g} V": self.supply is None,
+            f"loop.position_gain = {self.loop.position_gain:g}, a default": (
+                self.loop.position_gain == PwmLoop.position_gain
+            ),
+            "motor.rotor_inertia = 0": self.motor.rotor_inertia == 0.0,
+        }
+        assumptions = [text for text, is_missing in missing.items() if is_missing]
+        text = ", ".join(assumptions)
+        return f"assumed, because not specified: {text}" if text else ""
 
     def commands(self) -> Mapping[str, Command]:
         """Return the command `position` [rad] or [m]."""
         reason = "it would change what an action means"
-        fixed = dict.fromkeys(drive.ARM_FIELDS, reason)
+        fixed = dict.fromkeys(drive.ARM_FIELDS, reason) | dict.fromkeys(
+            ("loop.position_p", "loop.stiffness", "loop.firmware"),
+            "it was converted to loop.position_gain, which can be drawn",
+        )
         limit = self.loop.max_position * self.motor.arm_radius
         return {"position": Command("rad", self, 1.0 / self.arm_radius, limit, fixed)}
 
