@@ -297,9 +297,11 @@ def advance_target(
         stopping = math.sqrt(half * half + 2.0 * acceleration * abs(distance)) - half
         wanted = math.copysign(min(speed, stopping), distance)
         wanted = min(max(wanted, velocity - 2.0 * half), velocity + 2.0 * half)
-    # A target that arrives is set to the command, without the rounding of the division.
-    arrives = abs(wanted) == abs(distance) / period
-    return command if arrives else target + period * wanted, wanted
+    # The last sample has the rest of the way, at up to a*T more than the largest change of speed.
+    slow = acceleration == math.inf or abs(wanted) <= 2.0 * acceleration * period
+    if slow and wanted * distance >= 0.0 and abs(wanted) * period >= abs(distance):
+        return command, distance / period
+    return target + period * wanted, wanted
 
 
 def sample_loop(
