@@ -45,7 +45,7 @@ def servo(resistance=0.0, motor=MOTOR, **loop):
 class Bench:
     """A servo whose shaft is at given positions and speeds, both at the output."""
 
-    def __init__(self, actuator, timestep=0.002, inertia=math.inf, noise_key=7.0):
+    def __init__(self, actuator, timestep=0.002, inertia=math.inf, noise_key=7.0):  # noqa: D107
         self.family, self.timestep, self.inertia = type(actuator), timestep, inertia
         self.parameters = parameters_type(PwmServo)(*actuator.parameter_values)
         self.state = PwmServo.State(*[0.0] * len(PwmServo.State._fields))
@@ -191,7 +191,7 @@ def test_the_target_moves_at_its_largest_speed_and_acceleration(acceleration):
     bench.step(0.1, 0.1)
     path = np.array([0.1, *(bench.step(1.1, 0.1)[1].target for _ in range(500))])
     speed = np.diff(path) / 0.002
-    assert path[-1] == 1.1 and path.max() <= 1.1
+    assert path[-1] == path.max() == 1.1
     assert speed.max() == pytest.approx(limit, rel=1e-9)
     # Each sample of 1 ms has one speed, so that a ramp takes half a sample more.
     lasts = 1.0 / limit + (0.0 if math.isinf(acceleration) else limit / acceleration)
@@ -403,7 +403,8 @@ def test_a_gain_is_a_register_a_stiffness_or_a_duty_cycle():
     assert override_actuator(half, {"loop": {"position_p": 64.0}}).loop.register_p == 64.0
     assert override_actuator(half, {"loop": {"position_gain": 2.0}}).loop.position_gain == 2.0
     weaker = half.replaced({"supply.voltage": 3.7})
-    assert weaker.loop == half.loop and weaker.stiffness == pytest.approx(0.5 * half.stiffness)
+    assert weaker.loop == half.loop
+    assert weaker.stiffness == pytest.approx(0.5 * half.stiffness)
 
 
 def test_the_law_of_dynamixel_x_is_the_published_one():
