@@ -10,6 +10,7 @@ from codrl_mj.actuators.current_loop import (
 )
 from codrl_mj.actuators.drive import Drive, VoltageDrive
 from codrl_mj.actuators.gear_motor import GearMotor
+from codrl_mj.actuators.geared import Geared
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.lag import Lag
 from codrl_mj.actuators.model import (
@@ -71,6 +72,7 @@ __all__ = [
     "Drive",
     "Family",
     "GearMotor",
+    "Geared",
     "Ideal",
     "Inputs",
     "JointAdditions",
