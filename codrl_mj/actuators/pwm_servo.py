@@ -26,6 +26,8 @@ from codrl_mj.fields import Checked, choice, optional_nested, real
 
 HISTORY = 8
 """Number of commands that are on their way at the same time, at most."""
+SLACK = 1e-3
+"""Share of a step by which times may be off and still count as equal. Times in float32 need it."""
 MAX_PIECES = 64
 """Largest number of pieces with a constant speed between two samples of the servo."""
 
@@ -268,14 +270,14 @@ def command_in_force(
 ) -> float:
     """Return the newest command [rad] that has arrived at a time [s]; else the oldest one."""
     interval = max(1.0 / parameters.command_rate, timestep)
-    for age in range(8):
+    for age in range(HISTORY):
         number = max(newest - age, 0)
         # A command is sent at the first step that does not begin before its time.
-        sent = math.ceil(number * interval / timestep - 1e-6) * timestep
+        sent = math.ceil(number * interval / timestep - SLACK) * timestep
         delay = parameters.command_delay
         if parameters.command_jitter > 0.0:
             delay += parameters.command_jitter * noise.standard_normal(noise_key, number, 0)
-        if sent + max(delay, 0.0) <= time + 1e-6 * timestep:
+        if sent + max(delay, 0.0) <= time + SLACK * timestep:
             return commands[age]
     return commands.c8
 
@@ -374,7 +376,7 @@ def advance_motor(
     """
     viscous = parameters.viscous_friction
     braking = parameters.torque_constant * parameters.back_emf_constant / resistance + viscous
-    pieces = min(max(math.ceil(2.0 * duration * braking / rotor.inertia), 1), 64)
+    pieces = min(max(math.ceil(2.0 * duration * braking / rotor.inertia), 1), MAX_PIECES)
     has_losses = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
     mean, mean_square, torque = 0.0, 0.0, 0.0
     piece = duration / pieces
@@ -406,7 +408,7 @@ def advance(
     temperature = shaft.temperature_of(parameters, heat)
     resistance = shaft.resistance_at(parameters, temperature)
     is_hot = 1.0 if temperature > parameters.max_temperature else 0.0
-    newest = int(inputs.time / max(1.0 / parameters.command_rate, timestep) + 1e-6)
+    newest = int(inputs.time / max(1.0 / parameters.command_rate, timestep) + SLACK)
     is_new = is_first or newest + 1.0 > state.sent
     sent = newest + 1.0 if is_new else state.sent
     start = inputs.position / ratio
@@ -681,7 +683,7 @@ class PwmServo(Geared):
             f"motor.rotor_inertia = {motor.rotor_inertia:g}: the speed is held for"
             f" {period / pieces:g} s, in which the back-EMF changes it by {share:.3g} times its"
             f" value. The inertia at the rotor is {inertia:.3g} kg*m^2: set motor.rotor_inertia"
-            f" from the motor's datasheet, or shorten the step to {0.5 * timestep / share:.2g} s"
+            f" from the motor's datasheet, or shorten the step to {0.5 * period / share:.2g} s"
         )
         if share >= 2.0:
             raise UnstableError(
