@@ -29,7 +29,10 @@ AMPLITUDE = 0.1
 """Amplitude of the sines [rad]."""
 FREQUENCIES = np.geomspace(1.0, 32.0, 11)
 """Frequencies of the sines [Hz]."""
-_CYCLES, _MEASURED = 4, 2
+_CYCLES = 2
+"""Fewest cycles of a sine before the measurement, and during it."""
+_SETTLING, _MEASURED = 0.6, 0.25
+"""Shortest times [s] before the measurement, and of it."""
 
 
 class ServoTrace(NamedTuple):
@@ -200,10 +203,13 @@ class _Bench:
 
     def sine(self, frequency: float) -> complex:
         """Return amplitude and phase of the position over those of a sine of `AMPLITUDE`."""
-        steps = round(_CYCLES / frequency / self.timestep)
+        before, during = (
+            max(_CYCLES, math.ceil(frequency * duration)) for duration in (_SETTLING, _MEASURED)
+        )
+        steps = round((before + during) / frequency / self.timestep)
         turn = 2.0 * math.pi * frequency * self.timestep * np.arange(steps)
         position = self.run(AMPLITUDE * np.sin(turn)).position
-        kept = slice(steps - round(_MEASURED / frequency / self.timestep), None)
+        kept = slice(steps - round(during / frequency / self.timestep), None)
         waves = np.stack([np.sin(turn[kept]), np.cos(turn[kept]), np.ones(len(turn[kept]))], 1)
         real, imaginary, _ = np.linalg.lstsq(waves, position[kept], rcond=None)[0]
         return complex(real, imaginary) / AMPLITUDE
