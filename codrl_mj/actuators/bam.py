@@ -1,14 +1,16 @@
 """Servos in the JSON files of BAM (Better Actuator Models, github.com/Rhoban/bam).
 
 BAM's numbers are those of the output shaft: a winding without inductance and gear, and one of six
-models of friction. Its firmware computes the voltage g*(q* - q), where g is the product of voltage,
-`error_gain` and position gain. The torque kT/R*(g*(q* - q) - kT*w) is that of a `servo` with the
-velocity gain kT^2/R and the position gain g/kT, as long as the voltage suffices, and the same
-voltage limits it.
+models of friction. Its firmware computes the duty cycle `error_gain`*kp*(q* - q), as a `pwm_servo`
+does.
+
+A `pwm_servo` has no current limit. Firmware with one computes the voltage g*(q* - q), where g is
+the product of voltage, `error_gain` and kp. The torque kT/R*(g*(q* - q) - kT*w) is that of a
+`servo` with the velocity gain kT^2/R and the position gain g/kT, as long as the voltage suffices,
+and the same voltage limits it.
 """
 
 import math
-import warnings
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -16,6 +18,7 @@ from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.drive import Drive
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.parameters import FieldValue
+from codrl_mj.actuators.pwm_servo import PwmLoop, PwmServo
 from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
 from codrl_mj.actuators.servo_friction import ServoFriction
@@ -38,6 +41,8 @@ class ServoLaw(NamedTuple):
     """Largest duty."""
     max_current: float = math.inf
     """Largest current [A]."""
+    max_velocity: float = math.inf
+    """Largest speed [rad/s] of the target."""
 
 
 _MX = ServoLaw(15.0, 32.0, 0.158, 0.9625)
@@ -49,12 +54,19 @@ LAWS = {
     "mx106": _MX,
     "xl320": ServoLaw(7.5, 32.0, 0.05048199),
     "xl330": ServoLaw(7.5, 400.0, _XL330_GAIN, max_current=1.75),
-    "sts3215": ServoLaw(7.4, 32.0, 0.166, 0.97),
+    # Its target moves by 3,400 counts a second.
+    "sts3215": ServoLaw(7.4, 32.0, 0.166, 0.97, max_velocity=3400.0 * 2.0 * math.pi / 4096.0),
     "erob80_100": _EROB,
     "erob80_50": _EROB,
 }
 """Name of an actuator in BAM -> its law, from `better-actuator-models` 1.0.2 (Apache-2.0)."""
-_LAW_KEYS = {"vin": "voltage", "kp": "gain", "error_gain": "error_gain", "max_pwm": "max_duty"}
+_LAW_KEYS = {
+    "vin": "voltage",
+    "kp": "gain",
+    "error_gain": "error_gain",
+    "max_pwm": "max_duty",
+    "max_velocity": "max_velocity",
+}
 """Keys of a file that replace a number of the law -> its name in `ServoLaw`."""
 _FRICTION_KEYS = {
     "friction_base": ("base",),
@@ -87,12 +99,16 @@ _MODELS = {
     "m6": (*_M5, *(f"{name}_quad" for name in _DIRECTIONAL)),
 }
 """Model -> its numbers, besides the two of `m1`, which all have."""
-_UNUSED = {
-    "command_delay": "set the delay of commands in the environment (disturbances.command_delay)",
-    "max_velocity": "let the commands move no faster",
-}
-"""Numbers of the firmware that a servo has no field for, with the remedy."""
-_OTHERS = ("model", "actuator", "kt", "R", "armature", "q_offset", "error_gain_ratio")
+_OTHERS = (
+    "model",
+    "actuator",
+    "kt",
+    "R",
+    "armature",
+    "q_offset",
+    "error_gain_ratio",
+    "command_delay",
+)
 
 
 def is_bam(mapping: Mapping[str, FieldValue]) -> bool:
@@ -137,21 +153,22 @@ def bam_friction(friction: ServoFriction) -> dict[str, str | float]:
     return {"model": model} | {key: values[_FRICTION_KEYS[key][0]] for key in keys}
 
 
-def from_bam(mapping: Mapping[str, FieldValue]) -> Drive:
-    """Return the servo of a file of BAM; a drive if the file names no position gain.
+def from_bam(mapping: Mapping[str, FieldValue]) -> Drive | PwmServo:
+    """Return the servo of a file of BAM.
 
-    `q_offset` belongs to the bench of the logs and is ignored.
+    It is a `pwm_servo`; a `servo` if the firmware limits the current; a `drive` if it controls the
+    current, with a gain that the file does not have. `q_offset` belongs to the bench of the logs
+    and is ignored.
 
     Args:
         mapping: content of the file. Besides BAM's own keys it may have `vin` [V], `kp`,
             `error_gain` and `max_pwm`, which replace the values of BAM's package.
 
     Raises:
-        ValueError: the actuator has no winding or is unknown, or a number is missing, unknown or
-            out of bounds.
+        ValueError: the actuator has no winding or is unknown, or a number is missing, unknown, out
+            of bounds, or has no field in the actuator.
     """
-    known = (*_OTHERS, *_LAW_KEYS, *_UNUSED, *_FRICTION_KEYS)
-    check_names(mapping, known, "number of BAM's file")
+    check_names(mapping, (*_OTHERS, *_LAW_KEYS, *_FRICTION_KEYS), "number of BAM's file")
     check_names([mapping["actuator"]], LAWS, "actuator of BAM", list_all=True)
     if missing := [key for key in ("kt", "R", "armature") if key not in mapping]:
         raise ValueError(
@@ -161,7 +178,7 @@ def from_bam(mapping: Mapping[str, FieldValue]) -> Drive:
     law = LAWS[mapping["actuator"]]._replace(
         **{name: mapping[key] for key, name in _LAW_KEYS.items() if key in mapping}
     )
-    constant, resistance = mapping["kt"], mapping["R"]
+    constant, resistance, delay = mapping["kt"], mapping["R"], mapping.get("command_delay", 0.0)
     motor = GearMotor(
         resistance=resistance,
         inductance=ELECTRICAL_TIME_CONSTANT * resistance,
@@ -169,21 +186,30 @@ def from_bam(mapping: Mapping[str, FieldValue]) -> Drive:
         back_emf_constant=constant,
         rotor_inertia=mapping["armature"],
     )
-    parts = motor, SampledLoop(max_current=law.max_current), Supply(law.voltage * law.max_duty)
     friction = friction_from_bam(mapping)
-    for name in _UNUSED.keys() & mapping.keys():
-        if mapping[name]:
-            warnings.warn(
-                f"{name} = {mapping[name]:g} in BAM's file has no field in a servo:"
-                f" {_UNUSED[name]}",
-                stacklevel=2,
+    gain = (law.gain or 0.0) * law.error_gain * mapping.get("error_gain_ratio", 1.0)
+    if law.gain is not None and math.isinf(law.max_current):
+        duty_loop = PwmLoop(
+            position_gain=gain,
+            max_duty=law.max_duty,
+            max_velocity=law.max_velocity,
+            command_delay=delay,
+        )
+        return PwmServo(motor, duty_loop, Supply(law.voltage), friction=friction)
+    for name, value, neutral in (
+        ("command_delay", delay, 0.0),
+        ("max_velocity", law.max_velocity, math.inf),
+    ):
+        if value != neutral:
+            raise ValueError(
+                f"{name} = {value:g}: BAM's {mapping['actuator']} becomes an actuator with a"
+                " current limit, which has no such field; remove it from the file, and delay or"
+                " limit the commands before the actuator"
             )
+    parts = motor, SampledLoop(max_current=law.max_current), Supply(law.voltage * law.max_duty)
     if law.gain is None:
         return Drive(*parts, friction=friction)
-    volts_per_radian = (
-        law.voltage * law.gain * law.error_gain * mapping.get("error_gain_ratio", 1.0)
-    )
     loop = ServoLoop(
-        position_gain=volts_per_radian / constant, velocity_gain=constant * constant / resistance
+        position_gain=law.voltage * gain / constant, velocity_gain=constant * constant / resistance
     )
     return Servo(*parts, loop, friction=friction)

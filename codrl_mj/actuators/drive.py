@@ -10,25 +10,19 @@ the torque that moved the load.
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping
-from typing import ClassVar, NamedTuple, Self, cast
+from collections.abc import Callable, Mapping
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import sampled, shaft, stability
 from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.gear_motor import GearMotor
-from codrl_mj.actuators.model import (
-    ActuatorModel,
-    Command,
-    FamilyTuple,
-    Inputs,
-    JointAdditions,
-    UnstableError,
-)
-from codrl_mj.actuators.parameters import FieldValue, Parameters, parameters_type
+from codrl_mj.actuators.geared import Geared, has_single_friction
+from codrl_mj.actuators.model import Command, FamilyTuple, Inputs, UnstableError
+from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
-from codrl_mj.actuators.servo_friction import ServoFriction, has_servo_friction
+from codrl_mj.actuators.servo_friction import ServoFriction
 from codrl_mj.actuators.shaft import Shaft, StepAverages, TemperatureRises, Winding
 from codrl_mj.catalogue import MotorParameters
 from codrl_mj.fields import optional_nested
@@ -97,10 +91,10 @@ def limit_current(
     return min(max(current, -limit), limit)
 
 
-def begin_step(
+def begin_shaft(
     parameters: Parameters, timestep: float, state: FamilyTuple, inputs: Inputs
-) -> tuple[Winding, TemperatureRises, Shaft]:
-    """Return winding, temperatures and shaft at the beginning of a step, from a drive's state."""
+) -> Shaft:
+    """Return the shaft at the beginning of a step, from the state of a drive or a servo."""
     inertia, external_acceleration = shaft.inertia_of(parameters, inputs.inertia), 0.0
     # The estimate needs the previous step. A step that begins at another time than expected follows
     # a reset or a stage of Runge-Kutta.
@@ -112,7 +106,14 @@ def begin_step(
         external_acceleration = shaft.estimate_external_acceleration(
             timestep, inputs.speed - state.speed, state.acceleration, state.external_acceleration
         )
-    rotor = Shaft(inertia, external_acceleration, inputs.speed)
+    return Shaft(inertia, external_acceleration, inputs.speed)
+
+
+def begin_step(
+    parameters: Parameters, timestep: float, state: FamilyTuple, inputs: Inputs
+) -> tuple[Winding, TemperatureRises, Shaft]:
+    """Return winding, temperatures and shaft at the beginning of a step, from a drive's state."""
+    rotor = begin_shaft(parameters, timestep, state, inputs)
     winding = Winding(state.current, state.integral, state.pending)
     return winding, TemperatureRises(state.winding_rise, state.housing_rise), rotor
 
@@ -202,7 +203,7 @@ def observe(
 
 
 @dataclasses.dataclass(frozen=True)
-class Drive(ActuatorModel):
+class Drive(Geared):
     """Motor with its gear, the drive's current loop and the supply.
 
     Raises:
@@ -239,20 +240,6 @@ class Drive(ActuatorModel):
     )
     """Friction that depends on speed and load; None: only that of the motor's fields."""
 
-    def __post_init__(self) -> None:
-        """Validate."""
-        super().__post_init__()
-        # With both, the load on the gear would include the joint's own friction.
-        if self.friction in (None, ServoFriction()):
-            return
-        for name, neutral in _REPLACED_BY_FRICTION.items():
-            if (value := getattr(self.motor, name)) != neutral:
-                raise ValueError(
-                    f"motor.{name} = {value:g}: must be {neutral:g} if friction is set, which"
-                    " describes all friction at the output shaft: move the value to friction.base,"
-                    " viscous, stribeck or load_motor, or remove friction"
-                )
-
     @classmethod
     def from_motor_parameters(cls, parameters: MotorParameters) -> "Drive":
         """Return a drive for a motor, with its nominal voltage (or 24 V) and its peak current."""
@@ -263,49 +250,6 @@ class Drive(ActuatorModel):
             loop,
             None if voltage is None else Supply(voltage),
         )
-
-    @property
-    def arm_radius(self) -> float:
-        """Arm [m] between the rotor and the load, including the gear."""
-        return self.motor.arm_radius / self.motor.gear_ratio
-
-    @property
-    def additions(self) -> JointAdditions:
-        """Rotor inertia and friction, as seen from the load."""
-        arm, motor = self.arm_radius, self.motor
-        return JointAdditions(
-            motor.rotor_inertia / (arm * arm),
-            motor.viscous_friction / (arm * arm),
-            motor.coulomb_friction / arm,
-        )
-
-    @property
-    def delivered_friction(self) -> JointAdditions:
-        """Constant parts of `friction`; see `ActuatorModel.delivered_friction`."""
-        friction, arm = self.friction or ServoFriction(), self.motor.arm_radius
-        return JointAdditions(0.0, friction.viscous / (arm * arm), friction.base / arm)
-
-    @property
-    def back_emf_damping(self) -> float:
-        """Damping kT*kE/R at the load through the gear, as in `ActuatorModel.back_emf_damping`."""
-        motor = self.motor
-        braking = motor.torque_constant * motor.back_emf_constant / motor.resistance
-        return motor.gear_efficiency * braking / self.arm_radius**2
-
-    @property
-    def winding(self) -> tuple[float, float]:
-        """Resistance [ohm] and inductance [H]."""
-        return self.motor.resistance, self.motor.inductance
-
-    @property
-    def voltage_limit(self) -> float:
-        """Voltage [V] of the supply."""
-        return 24.0 if self.supply is None else self.supply.voltage
-
-    @property
-    def supply_resistance(self) -> float:
-        """Internal resistance [ohm] of the supply, by which its voltage drops under a current."""
-        return 0.0 if self.supply is None else self.supply.resistance
 
     @property
     def assumed(self) -> str:
@@ -333,25 +277,6 @@ class Drive(ActuatorModel):
             assumption for assumption, is_missing in missing.items() if is_missing
         )
         return f"assumed, because not specified: {assumptions}" if assumptions else ""
-
-    def as_mapping(self) -> dict[str, FieldValue]:
-        """Return the fields, without `friction` if that is None; see `ActuatorModel.as_mapping`."""
-        mapping = super().as_mapping()
-        # Runs are named by a hash of their mapping. Runs without this part keep their names.
-        if self.friction is None:
-            del mapping["friction"]
-        return mapping
-
-    @classmethod
-    def from_parameter_values(
-        cls, parameter_values: Iterable[float], arm_radius: float = 1.0
-    ) -> Self:
-        """Return the drive with these parameters.
-
-        The arm is that between rotor and load; the gear ratio is one of the parameters.
-        """
-        gear_ratio = parameters_type(cls)(*parameter_values).gear_ratio
-        return super().from_parameter_values(parameter_values, arm_radius * gear_ratio)
 
     def commands(self) -> Mapping[str, Command]:
         """Return the commands `current` [A], within `max_current`, and terminal `voltage` [V]."""
@@ -473,20 +398,10 @@ class Drive(ActuatorModel):
             columns.thermal_resistance_winding + columns.thermal_resistance_housing > 0.0
         )
         valid &= 1.0 + columns.resistance_coefficient * (columns.ambient_temperature - 25.0) > 0.0
-        # The function is written for numbers, and computes with arrays here.
-        has_friction = np.asarray(has_servo_friction(cast(Parameters, columns)))
-        for name, neutral in _REPLACED_BY_FRICTION.items():
-            valid &= ~has_friction | (getattr(columns, name) == neutral)
+        valid &= has_single_friction(columns)
         return np.where(valid, _radii(cls, parameter_values), np.inf)
 
 
-_REPLACED_BY_FRICTION = {
-    "coulomb_friction": 0.0,
-    "viscous_friction": 0.0,
-    "stribeck_friction": 0.0,
-    "gear_efficiency": 1.0,
-}
-"""Fields of the motor that the part `friction` replaces, with their values without friction."""
 ARM_FIELDS = ("motor.gear_ratio", "motor.arm_radius")
 """Fields that determine how a torque at the rotor acts on the joint."""
 _BYPASSED_BY_VOLTAGE = ("bandwidth", "kp", "ki", "anti_windup", "bemf_compensation", "max_current")

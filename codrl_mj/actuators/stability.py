@@ -262,13 +262,15 @@ WITHOUT_FRICTION = {
     "stribeck_friction": 0.0,
     "gear_efficiency": 1.0,
     "deadband": 0.0,
+    "start_duty": 0.0,
+    "encoder_counts": 0.0,
     **{
         f"friction_{field.name}": 0.0
         for field in dataclasses.fields(ServoFriction)
         if field.default == 0.0
     },
 }
-"""Parameter values without friction and dead zone, which would hide small motions."""
+"""Parameter values without friction, dead zone and resolution, which would hide small motions."""
 
 
 def linearize(

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import Drive, Servo, ServoFriction, resolve
+from codrl_mj.actuators import Drive, PwmServo, Servo, ServoFriction, resolve
 from codrl_mj.actuators.bam import LAWS, bam_friction
 from tests.actuators.test_servo_friction import MODELS
 from tests.actuators.test_shaft import on_a_shaft
@@ -92,6 +92,7 @@ def test_a_current_controlled_servo_is_a_drive(read):
         ({"model": "m2"}, "model 'm2': needs friction_stribeck, dtheta_stribeck, alpha"),
         ({"friction_bsae": 1.0}, "unknown number of BAM's file friction_bsae; did you mean"),
         ({"friction_base": -1.0}, "ServoFriction.base = -1.0: must be a finite number >= 0"),
+        ({"vin": math.inf, "actuator": "mx64"}, "PwmServo.supply.voltage = inf"),
         ({"kt": 0.0}, "GearMotor.torque_constant = 0.0"),
     ],
 )
@@ -109,9 +110,23 @@ def test_a_missing_resistance_is_not_replaced_by_a_start_value(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["command_delay", "max_velocity"])
-def test_numbers_without_a_field_are_named(read, name):
-    with pytest.warns(UserWarning, match=f"{name} = 0.02 in BAM's file has no field in a servo"):
+def test_numbers_without_a_field_are_refused_by_name(read, name):
+    with pytest.raises(ValueError, match=f"{name} = 0.02: BAM's xl330 becomes .*; remove it"):
         read(**{name: 0.02})
+
+
+def test_firmware_without_a_current_limit_gives_a_servo_of_duty_cycles(read):
+    numbers = {"command_delay": 0.02, "error_gain_ratio": 1.5}
+    servo = read(actuator="sts3215", **numbers)
+    assert type(servo) is PwmServo
+    assert servo.loop.position_gain == pytest.approx(32.0 * 0.166 * 1.5, rel=1e-12)
+    assert (servo.voltage_limit, servo.loop.max_duty) == (7.4, 0.97)
+    assert servo.loop.command_delay == 0.02
+    # 3,400 of 4,096 counts a second, unless the file has another speed.
+    assert servo.loop.max_velocity == pytest.approx(5.2155, rel=1e-4)
+    assert read(actuator="sts3215", max_velocity=4.0).loop.max_velocity == 4.0
+    assert servo.friction == ServoFriction(0.01, 5e-5)
+    assert math.isinf(read(actuator="mx64").loop.max_velocity)
 
 
 def test_every_number_of_the_largest_model_is_read_and_written_back(read):
@@ -131,20 +146,22 @@ def test_friction_is_written_as_the_smallest_model_that_has_it(model, read):
     assert vars(again) == vars(MODELS[model]) | shape
 
 
-@pytest.mark.parametrize("name", ["xl330", "mx106"])
+@pytest.mark.parametrize("name", ["xl330", "mx106", "feetech_sts3215_7_4V"])
 def test_a_servo_moves_as_in_bams_simulation(tmp_path, name):
     reason = "NOT RUN: BAM is not installed: pip install --no-deps better-actuator-models"
     models = pytest.importorskip("bam.model", reason=reason)
     from bam.simulate import Simulator
 
-    heavy = name == "mx106"
-    log = {"mass": 1.0 if heavy else 0.12, "arm_mass": 0.03, "length": 0.12, "kp": LAWS[name].gain}
+    # The only published model of the STS3215 is M1.
+    kind, actuator = ("m1", "sts3215") if name.startswith("feetech") else ("m6", name)
+    log = {"mass": 0.12 if name == "xl330" else 1.0, "arm_mass": 0.03, "length": 0.12}
+    log["kp"] = LAWS[actuator].gain
     inertia = (log["mass"] + log["arm_mass"] / 3.0) * log["length"] ** 2
     moment = (log["mass"] + log["arm_mass"] / 2.0) * log["length"]
     timestep, gaps = 0.001, {}
-    theirs = models.load_model(motor_name=name, model="m6")
+    theirs = models.load_model(motor_name=name, model=kind)
     numbers = {key: number.value for key, number in theirs.get_parameters().items()}
-    (tmp_path / "m6.json").write_text(json.dumps(numbers | {"model": "m6", "actuator": name}))
+    (tmp_path / "m6.json").write_text(json.dumps(numbers | {"model": kind, "actuator": actuator}))
     theirs.q_offset.value = 0.0
     theirs.actuator.load_log(log)
     times = timestep * np.arange(1500)
@@ -155,11 +172,11 @@ def test_a_servo_moves_as_in_bams_simulation(tmp_path, name):
         control = theirs.actuator.compute_control(target, simulator.q, simulator.dq, timestep)
         simulator.step(control, True, timestep)
     servo = resolve(tmp_path / "m6.json", None, "the test")
-    for label, friction in (("m6", servo.friction), ("m2", bam_without_load(servo.friction))):
-        actuator = servo.replaced({"friction": friction})
+    for label, friction in (("all", servo.friction), ("part", only_constant(servo.friction))):
+        changed = servo.replaced({"friction": friction})
         mass = log["mass"] + log["arm_mass"]
         model = on_a_shaft(
-            actuator,
+            changed,
             timestep,
             inertia=inertia - moment**2 / mass,
             mass=mass,
@@ -172,10 +189,10 @@ def test_a_servo_moves_as_in_bams_simulation(tmp_path, name):
             data.ctrl[0] = target
             mujoco.mj_step(model, data)
         gaps[label] = np.abs(np.array(angles) - expected).max() / np.ptp(expected)
-    assert gaps["m6"] < 0.005
-    assert gaps["m2"] > 2.0 * gaps["m6"]
+    assert gaps["all"] < 0.005
+    assert gaps["part"] > 2.0 * gaps["all"]
 
 
-def bam_without_load(friction):
-    """Return friction without the terms that depend on torques."""
-    return ServoFriction(*list(vars(friction).values())[:5])
+def only_constant(friction):
+    """Return friction with Coulomb's term alone."""
+    return ServoFriction(base=friction.base)
