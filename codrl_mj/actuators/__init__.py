@@ -10,6 +10,7 @@ from codrl_mj.actuators.current_loop import (
 )
 from codrl_mj.actuators.drive import Drive, VoltageDrive
 from codrl_mj.actuators.gear_motor import GearMotor
+from codrl_mj.actuators.geared import Geared
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.lag import Lag
 from codrl_mj.actuators.model import (
@@ -51,8 +52,10 @@ from codrl_mj.actuators.parameters import (
     parameter_paths,
     parameters_type,
 )
+from codrl_mj.actuators.pwm_servo import PwmLoop, PwmServo
 from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
+from codrl_mj.actuators.servo_friction import ServoFriction
 from codrl_mj.actuators.stability import check_stable, spectral_radii, spectral_radius
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 from codrl_mj.user_code import allow_imports
@@ -70,14 +73,18 @@ __all__ = [
     "Drive",
     "Family",
     "GearMotor",
+    "Geared",
     "Ideal",
     "Inputs",
     "JointAdditions",
     "Lag",
     "Motor",
     "Empty",
+    "PwmLoop",
+    "PwmServo",
     "SampledLoop",
     "Servo",
+    "ServoFriction",
     "ServoLoop",
     "Supply",
     "TorqueSpeed",

@@ -10,24 +10,19 @@ the torque that moved the load.
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping
-from typing import ClassVar, NamedTuple, Self
+from collections.abc import Callable, Mapping
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import sampled, shaft, stability
 from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.gear_motor import GearMotor
-from codrl_mj.actuators.model import (
-    ActuatorModel,
-    Command,
-    FamilyTuple,
-    Inputs,
-    JointAdditions,
-    UnstableError,
-)
-from codrl_mj.actuators.parameters import Parameters, parameters_type
+from codrl_mj.actuators.geared import Geared, has_single_friction
+from codrl_mj.actuators.model import Command, FamilyTuple, Inputs, UnstableError
+from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
+from codrl_mj.actuators.servo_friction import ServoFriction
 from codrl_mj.actuators.shaft import Shaft, StepAverages, TemperatureRises, Winding
 from codrl_mj.catalogue import MotorParameters
 from codrl_mj.fields import optional_nested
@@ -96,10 +91,10 @@ def limit_current(
     return min(max(current, -limit), limit)
 
 
-def begin_step(
+def begin_shaft(
     parameters: Parameters, timestep: float, state: FamilyTuple, inputs: Inputs
-) -> tuple[Winding, TemperatureRises, Shaft]:
-    """Return winding, temperatures and shaft at the beginning of a step, from a drive's state."""
+) -> Shaft:
+    """Return the shaft at the beginning of a step, from the state of a drive or a servo."""
     inertia, external_acceleration = shaft.inertia_of(parameters, inputs.inertia), 0.0
     # The estimate needs the previous step. A step that begins at another time than expected follows
     # a reset or a stage of Runge-Kutta.
@@ -111,7 +106,14 @@ def begin_step(
         external_acceleration = shaft.estimate_external_acceleration(
             timestep, inputs.speed - state.speed, state.acceleration, state.external_acceleration
         )
-    rotor = Shaft(inertia, external_acceleration, inputs.speed)
+    return Shaft(inertia, external_acceleration, inputs.speed)
+
+
+def begin_step(
+    parameters: Parameters, timestep: float, state: FamilyTuple, inputs: Inputs
+) -> tuple[Winding, TemperatureRises, Shaft]:
+    """Return winding, temperatures and shaft at the beginning of a step, from a drive's state."""
+    rotor = begin_shaft(parameters, timestep, state, inputs)
     winding = Winding(state.current, state.integral, state.pending)
     return winding, TemperatureRises(state.winding_rise, state.housing_rise), rotor
 
@@ -201,7 +203,7 @@ def observe(
 
 
 @dataclasses.dataclass(frozen=True)
-class Drive(ActuatorModel):
+class Drive(Geared):
     """Motor with its gear, the drive's current loop and the supply.
 
     Raises:
@@ -232,6 +234,11 @@ class Drive(ActuatorModel):
     """The current loop."""
     supply: Supply | None = optional_nested(Supply(voltage=24.0))
     """Supply of the drive; None: 24 V without a resistance."""
+    # As `fields.optional_nested`, but taken by its name only, so that the positions of others stay.
+    friction: ServoFriction | None = dataclasses.field(
+        default=None, kw_only=True, metadata={"absent": ServoFriction()}
+    )
+    """Friction that depends on speed and load; None: only that of the motor's fields."""
 
     @classmethod
     def from_motor_parameters(cls, parameters: MotorParameters) -> "Drive":
@@ -243,43 +250,6 @@ class Drive(ActuatorModel):
             loop,
             None if voltage is None else Supply(voltage),
         )
-
-    @property
-    def arm_radius(self) -> float:
-        """Arm [m] between the rotor and the load, including the gear."""
-        return self.motor.arm_radius / self.motor.gear_ratio
-
-    @property
-    def additions(self) -> JointAdditions:
-        """Rotor inertia and friction, as seen from the load."""
-        arm, motor = self.arm_radius, self.motor
-        return JointAdditions(
-            motor.rotor_inertia / (arm * arm),
-            motor.viscous_friction / (arm * arm),
-            motor.coulomb_friction / arm,
-        )
-
-    @property
-    def back_emf_damping(self) -> float:
-        """Damping kT*kE/R at the load through the gear, as in `ActuatorModel.back_emf_damping`."""
-        motor = self.motor
-        braking = motor.torque_constant * motor.back_emf_constant / motor.resistance
-        return motor.gear_efficiency * braking / self.arm_radius**2
-
-    @property
-    def winding(self) -> tuple[float, float]:
-        """Resistance [ohm] and inductance [H]."""
-        return self.motor.resistance, self.motor.inductance
-
-    @property
-    def voltage_limit(self) -> float:
-        """Voltage [V] of the supply."""
-        return 24.0 if self.supply is None else self.supply.voltage
-
-    @property
-    def supply_resistance(self) -> float:
-        """Internal resistance [ohm] of the supply, by which its voltage drops under a current."""
-        return 0.0 if self.supply is None else self.supply.resistance
 
     @property
     def assumed(self) -> str:
@@ -308,24 +278,15 @@ class Drive(ActuatorModel):
         )
         return f"assumed, because not specified: {assumptions}" if assumptions else ""
 
-    @classmethod
-    def from_parameter_values(
-        cls, parameter_values: Iterable[float], arm_radius: float = 1.0
-    ) -> Self:
-        """Return the drive with these parameters.
-
-        The arm is that between rotor and load; the gear ratio is one of the parameters.
-        """
-        gear_ratio = parameters_type(cls)(*parameter_values).gear_ratio
-        return super().from_parameter_values(parameter_values, arm_radius * gear_ratio)
-
     def commands(self) -> Mapping[str, Command]:
         """Return the commands `current` [A], within `max_current`, and terminal `voltage` [V]."""
         limit, torque = self.controller.max_current, self.motor.torque_constant
         fixed = dict.fromkeys(
             ("motor.torque_constant", *ARM_FIELDS), "it would change what an action means"
         )
-        voltage_drive = VoltageDrive(self.motor, self.controller, self.supply)
+        voltage_drive = VoltageDrive(
+            self.motor, self.controller, self.supply, friction=self.friction
+        )
         bypassed = [
             "motor.max_temperature",
             *(f"controller.{name}" for name in _BYPASSED_BY_VOLTAGE),
@@ -437,6 +398,7 @@ class Drive(ActuatorModel):
             columns.thermal_resistance_winding + columns.thermal_resistance_housing > 0.0
         )
         valid &= 1.0 + columns.resistance_coefficient * (columns.ambient_temperature - 25.0) > 0.0
+        valid &= has_single_friction(columns)
         return np.where(valid, _radii(cls, parameter_values), np.inf)
 
 

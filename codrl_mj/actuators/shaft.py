@@ -12,6 +12,7 @@ from codrl_mj.actuators import sampled
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
+from codrl_mj.actuators.servo_friction import friction_torque, has_servo_friction
 
 RATED_TEMPERATURE = 25.0
 """Temperature [degC] at which datasheets state resistances."""
@@ -186,6 +187,25 @@ def friction(parameters: Parameters, duration: float, torque: float, shaft: Shaf
     return math.copysign(min(level, stopping_torque), free_speed) if free_speed != 0.0 else 0.0
 
 
+def servo_friction(parameters: Parameters, duration: float, torque: float, shaft: Shaft) -> float:
+    """Return the torque [N*m] of the part `friction` at the rotor, for the rotor's quantities."""
+    ratio = parameters.gear_ratio
+    square = ratio * ratio
+    load_torque = 0.0
+    if shaft.inertia < math.inf:
+        load_torque = ratio * shaft.inertia * shaft.external_acceleration
+    at_output = friction_torque(
+        parameters,
+        duration,
+        shaft.inertia * square,
+        parameters.rotor_inertia * square,
+        shaft.speed / ratio,
+        torque * ratio,
+        load_torque,
+    )
+    return at_output / ratio
+
+
 def has_thermal_model(parameters: Parameters) -> bool:
     """Return True if the motor's temperature can change."""
     return parameters.thermal_resistance_winding + parameters.thermal_resistance_housing > 0.0
@@ -300,9 +320,14 @@ def advance_motor(
     # Viscous friction belongs to the joint, and `external_acceleration` includes it at the initial
     # speed. So only the change since then is added.
     viscous = parameters.viscous_friction
-    braking = parameters.torque_constant * parameters.back_emf_constant / resistance + viscous
+    braking = (
+        parameters.torque_constant * parameters.back_emf_constant / resistance
+        + viscous
+        + parameters.friction_viscous / (parameters.gear_ratio * parameters.gear_ratio)
+    )
     pieces = min(max(math.ceil(2.0 * duration * braking / shaft.inertia), 1), samples)
     has_losses = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
+    is_servo = has_servo_friction(parameters)
     amperes, volts, torque, power, heat = 0.0, 0.0, 0.0, 0.0, 0.0
     saturated, samples_left, speed = 0, samples, shaft.speed
     for piece in range(pieces):
@@ -312,9 +337,11 @@ def advance_motor(
         )
         samples_left, saturated = samples_left - count, saturated + limited
         share, delivered = count / samples, parameters.torque_constant * mean
+        shaft_now = Shaft(shaft.inertia, shaft.external_acceleration, speed)
         if has_losses:
-            shaft_now = Shaft(shaft.inertia, shaft.external_acceleration, speed)
             delivered -= friction(parameters, share * duration, delivered, shaft_now)
+        elif is_servo:
+            delivered -= servo_friction(parameters, share * duration, delivered, shaft_now)
         amperes = amperes + share * mean
         volts = volts + share * voltage
         torque = torque + share * delivered

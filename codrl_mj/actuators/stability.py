@@ -9,6 +9,7 @@ import numpy as np
 
 from codrl_mj.actuators.model import ActuatorModel, Advance, Inputs, UnstableError
 from codrl_mj.actuators.parameters import FieldValue, parameters_type
+from codrl_mj.actuators.servo_friction import ServoFriction
 
 # The function is written for numbers, and computes with arrays here.
 ElectricalStep = Callable[..., tuple[Any, ...]]
@@ -257,8 +258,19 @@ class Joints(NamedTuple):
 
 PERTURBATION = -1e-6
 """Perturbation added to each state in turn. It is negative, so a counter that is due stays due."""
-WITHOUT_FRICTION = {"stribeck_friction": 0.0, "gear_efficiency": 1.0, "deadband": 0.0}
-"""Parameter values without friction and dead zone, which would hide small motions."""
+WITHOUT_FRICTION = {
+    "stribeck_friction": 0.0,
+    "gear_efficiency": 1.0,
+    "deadband": 0.0,
+    "start_duty": 0.0,
+    "encoder_counts": 0.0,
+    **{
+        f"friction_{field.name}": 0.0
+        for field in dataclasses.fields(ServoFriction)
+        if field.default == 0.0
+    },
+}
+"""Parameter values without friction, dead zone and resolution, which would hide small motions."""
 
 
 def linearize(

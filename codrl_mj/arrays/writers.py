@@ -18,6 +18,7 @@ from codrl_mj.arrays.written_models import (
     format_number,
     torque_speed_line,
     winding_of,
+    written_additions,
 )
 
 Target = Literal["c", "mjlab", "isaaclab", "newton", "dcmotor", "bam"]
@@ -90,7 +91,7 @@ def write_motor(actuator: ActuatorModel, target: Target, joint: str | None = Non
     slides = isinstance(actuator, Drive) and actuator.motor.arm_radius != 1.0
     units = ("N", "m/s") if slides else ("N*m", "rad/s")
     name = joint or ("joint" if target == "dcmotor" else ".*")
-    text = writers[target](actuator, _Joint(name, actuator.additions, *units))
+    text = writers[target](actuator, _Joint(name, written_additions(actuator), *units))
     lost = lost_fields(actuator, target) if isinstance(actuator, Drive) else ()
     return WrittenMotor(target, text, slides, lost, compare(actuator, target))
 

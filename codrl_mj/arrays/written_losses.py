@@ -13,10 +13,13 @@ import numpy as np
 from codrl_mj.actuators import ActuatorModel, Drive, Inputs, TorqueSpeed, parameters_type
 from codrl_mj.actuators.model import FamilyTuple
 from codrl_mj.actuators.parameters import choices_of, value_at
+from codrl_mj.actuators.servo_friction import LOAD_TERMS
 from codrl_mj.arrays.array_code import advance
 from codrl_mj.arrays.written_models import (
+    bam_motor_torque,
     bam_torque,
     dcmotor_element,
+    friction_of,
     torque_speed_line,
     winding_of,
     winding_torque,
@@ -133,6 +136,17 @@ _PLACES = (
         ("bam",),
         [0.0],
     ),
+    _Place(_of("friction", "base", "viscous"), "", _EVERYWHERE),
+    _Place(
+        _of("friction", "stribeck", "stribeck_speed", "stribeck_exponent"),
+        "no friction that decreases with the speed",
+        ("bam",),
+        [0.0],
+    ),
+    *(
+        _Place((f"friction.{name}",), "no friction that grows with torques", ("bam",), [0.0])
+        for name in LOAD_TERMS
+    ),
     _Place(("motor.load_inertia",), "the speed is not predicted within a step", neutral=[0.0]),
     _Place(
         ("motor.max_temperature",),
@@ -192,6 +206,9 @@ def compare(actuator: ActuatorModel, target: str) -> WrittenComparison:
         actuator: a `Drive` or a `TorqueSpeed`.
         target: `mjlab`, `isaaclab`, `newton`, `dcmotor` or `bam`.
     """
+    if isinstance(actuator, Drive) and actuator.friction is not None:
+        # Both simulators have the constant friction, one in the torque and one in the joint.
+        actuator = actuator.replaced({"friction.base": 0.0, "friction.viscous": 0.0})
     line = torque_speed_line(actuator)
     # An even number of points leaves out the standstill, where friction has no direction.
     ends = np.linspace(-OVERRANGE, OVERRANGE, NUM_POINTS)
@@ -232,7 +249,8 @@ def steady_torque(actuator: ActuatorModel, desired: np.ndarray, speed: np.ndarra
         timestep = math.ceil(shortest * rate) / rate
     state = _at_rest(actuator, np.zeros_like(speed))
     torque: np.ndarray = np.zeros_like(speed)
-    for step in range(2):
+    # The load of a held speed balances the torque. Half of its error remains after a step.
+    for step in range(2 if friction_of(actuator) is None else 50):
         # With a huge inertia the speed is held, and friction is not limited to what stops a rotor.
         # The fields of `Inputs` are floats, but `advance` takes arrays in their place.
         arrays: FamilyTuple = (desired * arm, 0.0, speed / arm, step * timestep, 0.0, _HELD)
@@ -273,9 +291,18 @@ def _motions(
     if target in _LINES:
         return ours, _move(_stepper(line, timestep, inertia), commands, timestep, inertia)
 
+    friction, winding = friction_of(actuator), winding_of(actuator, "bam")
+
     def bam(desired: float, speed: float, time: float) -> float:
         del time
-        return float(bam_torque(actuator, np.array(desired), np.array(speed)))
+        point = np.array(desired), np.array(speed)
+        if friction is None:
+            return float(bam_torque(actuator, *point))
+        # The load is free, so friction is at most the torque that stops it within the step.
+        torque = bam_motor_torque(winding, *point)
+        stopping = inertia * speed / timestep + torque
+        limit = friction.limit(point[1], torque, np.array(0.0))
+        return float(torque - np.clip(stopping, -limit, limit))
 
     return ours, _move(bam, commands, timestep, inertia)
 

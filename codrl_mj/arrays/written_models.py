@@ -10,7 +10,15 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, Drive, GearMotor, TorqueSpeed
+from codrl_mj.actuators import (
+    ActuatorModel,
+    Drive,
+    GearMotor,
+    JointAdditions,
+    ServoFriction,
+    TorqueSpeed,
+)
+from codrl_mj.actuators.bam import bam_friction
 from codrl_mj.actuators.shaft import RATED_TEMPERATURE, resistance_at
 
 
@@ -111,12 +119,22 @@ def winding_torque(winding: WrittenWinding, desired: np.ndarray, speed: np.ndarr
     return winding.gear * limited
 
 
+def written_additions(actuator: ActuatorModel) -> JointAdditions:
+    """Return what a joint gets in another simulator, with the constant friction in the torque."""
+    additions, delivered = actuator.additions, actuator.delivered_friction
+    return JointAdditions(
+        additions.armature,
+        additions.damping + delivered.damping,
+        additions.friction + delivered.friction,
+    )
+
+
 def bam_parameters(drive: ActuatorModel) -> dict[str, str | float]:
     """Return BAM's parameters of a drive, at the joint.
 
     A model of BAM takes defaults for what the file omits, so every parameter is written. The
     models differ in their friction: `m1` is Coulomb's, `m2` adds Stribeck's, and `m5` losses that
-    grow with the load.
+    grow with the load. The part `friction` is written as the first of the six that has its numbers.
     """
     winding = winding_of(drive, "bam")
     motor, additions, gear = _motor_of(drive), drive.additions, winding.gear
@@ -130,6 +148,9 @@ def bam_parameters(drive: ActuatorModel) -> dict[str, str | float]:
         "friction_base": additions.friction,
         "friction_viscous": additions.damping,
     }
+    friction = friction_of(drive)
+    if friction is not None:
+        return values | bam_friction(friction)
     if motor.stribeck_friction > 0.0 or motor.gear_efficiency < 1.0:
         values |= {
             "model": "m2",
@@ -149,19 +170,30 @@ def bam_parameters(drive: ActuatorModel) -> dict[str, str | float]:
 
 
 def bam_torque(drive: ActuatorModel, desired: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    """Return BAM's steady torque at a moving joint, without Coulomb and viscous friction."""
+    """Return BAM's steady torque at a moving joint, without the friction of the joint.
+
+    If the motor has the part `friction`, the torque is that which drives a load at a held speed.
+    """
     winding, motor = winding_of(drive, "bam"), _motor_of(drive)
-    back_emf, limit = winding.volts_per_speed * speed, winding.volts_per_force * winding.max_force
-    # BAM limits the current before the voltage. As with our drives, a joint that turns fast enough
-    # drives more than the largest current through the winding.
-    volts = np.clip(winding.volts_per_force * desired, -limit, limit) + back_emf
-    volts = np.clip(volts, -winding.voltage, winding.voltage)
-    torque = (volts - back_emf) / winding.volts_per_force
+    torque, servo_friction = bam_motor_torque(winding, desired, speed), friction_of(drive)
+    if servo_friction is not None:
+        return servo_friction.net_torque(torque, speed)
     friction = (1.0 - motor.gear_efficiency) * np.abs(torque) + winding.gear * motor.stribeck(
         winding.gear * speed
     )
     net: np.ndarray = torque - friction * np.sign(speed)
     return net
+
+
+def bam_motor_torque(winding: WrittenWinding, desired: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """Return BAM's steady torque at the joint before friction."""
+    back_emf, limit = winding.volts_per_speed * speed, winding.volts_per_force * winding.max_force
+    # BAM limits the current before the voltage. As with our drives, a joint that turns fast enough
+    # drives more than the largest current through the winding.
+    volts = np.clip(winding.volts_per_force * desired, -limit, limit) + back_emf
+    volts = np.clip(volts, -winding.voltage, winding.voltage)
+    torque: np.ndarray = (volts - back_emf) / winding.volts_per_force
+    return torque
 
 
 def format_number(value: float) -> str:
@@ -219,6 +251,14 @@ def total_resistance(drive: Drive) -> float:
 def full_voltage(drive: Drive) -> float:
     """Return the largest voltage [V] at the winding's terminals, without a current."""
     return max(drive.voltage_limit - drive.controller.deadband, 0.0)
+
+
+def friction_of(actuator: ActuatorModel) -> ServoFriction | None:
+    """Return the part `friction` of a drive at its joint; None if it has none."""
+    if not isinstance(actuator, Drive) or actuator.friction is None:
+        return None
+    # A pinion, drum or wheel turns torques of the output shaft into forces of a slide.
+    return actuator.friction.at_arm(actuator.motor.arm_radius)
 
 
 def _motor_of(actuator: ActuatorModel) -> GearMotor:

@@ -135,7 +135,8 @@ FAMILY = "actuator.family"
 """Name of the flag for the family of an actuator, for `scan_flags`."""
 _FAMILY_HELP = (
     "Another family for the same motor: `servo` turns a motor or a datasheet into a servo, which"
-    " takes a position as its command."
+    " takes a position as its command; `pwm_servo` into one without a current loop, as bus servos"
+    " and hobby servos are."
 )
 AS_TRAINED, AS_CONFIGURED = "as-trained", "as-configured"
 """Defaults of --actuator that do not name an actuator: the actuator of the policy's training, and

@@ -184,9 +184,13 @@ def _raise_unknown_words(tokens: Sequence[str], help_text: str, program: str) ->
             " one"
         )
     if "--actuator" in known_flags and (owners := _families_with(flag)):
+        servos = [name for name in owners if name.endswith("servo")]
         hint = f"this actuator has no such field; a {' or a '.join(owners)} has; "
         hint += (
-            "add --actuator.family servo to make a motor a servo; " if owners == ["servo"] else ""
+            f"add {' or '.join(f'--actuator.family {name}' for name in servos)} to make a motor a"
+            " servo; "
+            if servos == owners
+            else ""
         )
     raise ValueError(f"unknown flag {flag}: {hint}{program} --help lists them")
 

@@ -26,10 +26,12 @@ class MotorWarning(UserWarning):
 
 
 def _added_dynamics(actuator: ActuatorModel, gear: float = 1.0) -> JointAdditions:
-    """Return the motor's additions at its joint, beyond a gear; back-EMF counts as damping."""
+    """Return the motor's dynamics at its joint, beyond a gear; back-EMF counts as damping."""
     armature, damping, friction = actuator.additions
+    delivered = actuator.delivered_friction
+    damping += delivered.damping + actuator.back_emf_damping
     return JointAdditions(
-        gear**2 * armature, gear**2 * (damping + actuator.back_emf_damping), abs(gear) * friction
+        gear**2 * armature, gear**2 * damping, abs(gear) * (friction + delivered.friction)
     )
 
 

@@ -62,7 +62,10 @@ def _servo_remedy(actuator: ActuatorModel, name: str) -> str:
     changes |= {"loop.controls": name} if isinstance(actuator, Servo) or name == "velocity" else {}
     flags = " ".join(f"--actuator.{field} {value}" for field, value in changes.items())
     fields = " and ".join(f"{field} = {value!r}" for field, value in changes.items())
-    return f"to command the {name} of the same motor, set {fields} ({flags})"
+    text = f"to command the {name} of the same motor, set {fields} ({flags})"
+    if name == "position" and not isinstance(actuator, Servo):
+        text += "; a bus servo or hobby servo is a pwm_servo"
+    return text
 
 
 class TaskCommands:

@@ -28,8 +28,17 @@ START_DURATION = 0.03
 
 
 def base_motor(base: Mapping[str, object] | None) -> GearMotor | None:
-    """Return the motor of a drive's mapping; None if it has none."""
+    """Return the motor of a drive's mapping; None if it has none.
+
+    Raises:
+        ValueError: the drive has the part `friction`, which a fit does not estimate.
+    """
     drive = None if base is None else actuator_from_mapping(base)
+    if isinstance(drive, Drive) and drive.friction is not None:
+        raise ValueError(
+            "friction: identification estimates the friction of the motor's fields, such as"
+            " motor.coulomb_friction and motor.gear_efficiency; remove friction from the base"
+        )
     return drive.motor if isinstance(drive, Drive) else None
 
 

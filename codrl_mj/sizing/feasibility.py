@@ -49,7 +49,16 @@ def operating_points(demand: Demand, drive: Drive) -> OperatingPoints:
     may be the last one of the previous episode. If the motor brakes or holds, eta is 1: the losses
     of the gear then help, and are ignored. Energies use the mean speed in a step, all other values
     the speed at its start.
+
+    Raises:
+        ValueError: the drive has the part `friction`.
     """
+    if drive.friction is not None:
+        raise ValueError(
+            "friction: the sizing of motors takes no friction that depends on the load; remove"
+            " friction, and set motor.coulomb_friction, motor.viscous_friction and"
+            " motor.gear_efficiency instead"
+        )
     motor, added, arm = drive.motor, drive.additions, drive.arm_radius
     stribeck = motor.stribeck(demand.speed / arm) / arm
     own_torque = added.armature * demand.acceleration + added.damping * demand.speed

@@ -19,12 +19,14 @@ from codrl_mj.actuators import (
     ActuatorModel,
     ActuatorSetting,
     Drive,
-    GearMotor,
+    PwmLoop,
+    PwmServo,
     Servo,
     ServoLoop,
     override_actuator,
     resolve,
 )
+from codrl_mj.actuators.geared import Geared
 from codrl_mj.catalogue import (
     MotorEntry,
     MotorParameters,
@@ -51,7 +53,7 @@ def find_drive(
 ) -> Drive:
     """Return a drive by name, with overridden fields; None keeps a field.
 
-    A servo is returned without its outer loops.
+    A servo is returned without its outer loops, also one that has no current loop.
 
     Args:
         name: anything that `codrl_mj.actuators.resolve` accepts, such as a catalogue motor.
@@ -78,7 +80,7 @@ def find_drive(
         "supply": {"voltage": voltage},
     }
     base: ActuatorModel = resolve(name, None, "a motor on its own")
-    if isinstance(base, Servo):
+    if isinstance(base, Servo | PwmServo):
         base = override_actuator(base, {"family": Drive.family})
     if type(base) is not Drive:
         reason = f" ({base.assumed})" if base.assumed else ""
@@ -137,15 +139,14 @@ def drive_limits(drive: Drive) -> DriveLimits:
     motor, resistance = drive.motor, drive.motor.resistance + drive.supply_resistance
     torque_per_current = motor.torque_constant * motor.gear_efficiency  # [N*m/A]
     voltage_per_torque = resistance / torque_per_current  # [V/(N*m)]
-    voltage_per_speed = motor.back_emf_constant + voltage_per_torque * motor.viscous_friction
-    effective_voltage = max(drive.voltage_limit - voltage_per_torque * motor.coulomb_friction, 0.0)
+    coulomb, viscous = _unloaded_friction(drive)
+    voltage_per_speed = motor.back_emf_constant + voltage_per_torque * viscous
+    effective_voltage = max(drive.voltage_limit - voltage_per_torque * coulomb, 0.0)
     speed = effective_voltage / voltage_per_speed if voltage_per_speed > 0.0 else math.inf
-    friction = motor.coulomb_friction + (
-        motor.viscous_friction * speed if motor.viscous_friction > 0.0 else 0.0
-    )
+    friction = coulomb + (viscous * speed if viscous > 0.0 else 0.0)
     stall_current = drive.voltage_limit / resistance
     peak_torque, blocked_torque = _at_output(
-        motor,
+        drive,
         np.array([min(stall_current, drive.controller.max_current), stall_current]),
         np.zeros(2),
     )
@@ -174,11 +175,7 @@ def max_power(drive: Drive) -> float:
 
 def continuous_torque(drive: Drive, current: float | None) -> float | None:
     """Return the standstill torque [N*m] at a continuous current [A]; None if that is unknown."""
-    return (
-        None
-        if current is None
-        else float(_at_output(drive.motor, np.array(current), np.array(0.0)))
-    )
+    return None if current is None else float(_at_output(drive, np.array(current), np.array(0.0)))
 
 
 class DiagramLimit(NamedTuple):
@@ -235,7 +232,7 @@ def torque_limits(
     winding = drive.motor.resistance, drive.voltage_limit, drive.supply_resistance
     lowest, highest = -highest_current(*winding, -back_emf), highest_current(*winding, back_emf)
     low, high = (np.clip(bound, lowest, highest) for bound in (-current, current))
-    return _at_output(drive.motor, low, speeds), _at_output(drive.motor, high, speeds)
+    return _at_output(drive, low, speeds), _at_output(drive, high, speeds)
 
 
 def highest_current(
@@ -252,9 +249,27 @@ def highest_current(
     return highest
 
 
-def _at_output(motor: GearMotor, current: np.ndarray, speed: np.ndarray) -> np.ndarray:
+def _unloaded_friction(drive: Drive) -> tuple[float, float]:
+    """Return Coulomb [N*m] and viscous friction [N*m*s/rad] at the rotor of a motor without load.
+
+    Friction that grows with the motor's torque t, f + c*t, takes as much torque as f/(1 - c).
+    """
+    motor, friction = drive.motor, drive.friction
+    if friction is None:
+        return motor.coulomb_friction, motor.viscous_friction
+    share = motor.gear_ratio * max(1.0 - friction.load_motor, 1e-9)
+    return (
+        motor.coulomb_friction + friction.base / share,
+        motor.viscous_friction + friction.viscous / (share * motor.gear_ratio),
+    )
+
+
+def _at_output(drive: Drive, current: np.ndarray, speed: np.ndarray) -> np.ndarray:
     """Return the net torque [N*m] at the output, for a current [A] and an output speed [rad/s]."""
+    motor = drive.motor
     torque = motor.torque_constant * current
+    if drive.friction is not None:
+        return drive.friction.net_torque(motor.gear_ratio * torque, speed)
     torque = torque * np.where(
         torque * speed >= 0.0, motor.gear_efficiency, 1.0 / motor.gear_efficiency
     )
@@ -318,10 +333,10 @@ def catalogue_rows(sort: str = "name") -> list[CatalogueRow]:
     return sorted(rows, key=lambda row: (row[sort] is None, -(row[sort] or 0.0)))
 
 
-def find_loop(name: ActuatorSetting) -> ServoLoop | None:
+def find_loop(name: ActuatorSetting) -> ServoLoop | PwmLoop | None:
     """Return the outer loops of the servo with a name of `find_drive`; None for other actuators."""
     base: ActuatorModel = resolve(name, None, "a motor on its own")
-    return base.loop if isinstance(base, Servo) else None
+    return base.loop if isinstance(base, Servo | PwmServo) else None
 
 
 class Quantity(TypedDict):
@@ -363,7 +378,9 @@ class MotorReport(TypedDict):
 
 
 def describe_motor(
-    drive: Drive, entry: MotorEntry | None = None, loop: ServoLoop | None = None
+    drive: Drive,
+    entry: MotorEntry | None = None,
+    loop: ServoLoop | PwmLoop | None = None,
 ) -> MotorReport:
     """Return all known data of a motor as JSON-serializable values, of which some may be infinite.
 
@@ -374,10 +391,14 @@ def describe_motor(
     """
     parts = {
         "motor": drive.motor,
-        "controller": drive.controller,
+        "controller": None if isinstance(loop, PwmLoop) else drive.controller,
         "supply": drive.supply,
+        "friction": drive.friction,
         "loop": loop,
     }
+    simulated: Geared = drive
+    if isinstance(loop, PwmLoop):
+        simulated = PwmServo(drive.motor, loop, drive.supply, friction=drive.friction)
     report: MotorReport = {
         "drive": [
             _value(
@@ -386,12 +407,13 @@ def describe_motor(
             for part, owner in parts.items()
             if owner is not None
             for field in dataclasses.fields(owner)
+            if not (isinstance(owner, PwmLoop) and field.name in ("position_p", "stiffness"))
         ],
         "abilities": [
             _value(name, value, LIMIT_UNITS[name])
             for name, value in drive_limits(drive)._asdict().items()
         ],
-        "assumed": drive.assumed,
+        "assumed": simulated.assumed,
     }
     if entry is None:
         return report

@@ -20,6 +20,7 @@ from codrl_mj.actuators import (
     Inputs,
     Lag,
     Motor,
+    PwmServo,
     Supply,
     family_id,
     family_name,
@@ -79,11 +80,11 @@ def test_parameters_round_trip(actuator):
         == copy
     )
     # The gear ratio is divided into the arm and multiplied out again.
-    if family is Drive:
+    if family in (Drive, PwmServo):
         assert copy.motor.arm_radius == pytest.approx(actuator.motor.arm_radius, rel=1e-15)
         copy = copy.replaced({"motor.arm_radius": actuator.motor.arm_radius})
     # The parameters of no supply are those of its default.
-    if family in (DCMotorActuator, Drive):
+    if family in (DCMotorActuator, Drive, PwmServo):
         actuator = dataclasses.replace(actuator, supply=copy.supply)
     assert copy == actuator
 

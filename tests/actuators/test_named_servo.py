@@ -161,9 +161,10 @@ def test_an_agent_commands_positions_or_speeds_of_a_named_motor(controls):
             r"loop\.velocity_gain is missing",
         ),
         (
-            {"name": MOTOR, "friction": 1.0},
-            r"did you mean motor\.coulomb_friction or motor\.viscous_friction",
+            {"name": MOTOR, "temperature": 1.0},
+            r"did you mean motor\.ambient_temperature or motor\.max_temperature",
         ),
+        ({"name": MOTOR, "friction": 1.0}, "'friction' = 1.0: must be a mapping of ServoFriction"),
     ],
 )
 def test_raises_with_a_remedy_if_a_servo_cannot_be_made(setting, message):

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import Drive, Lag, TorqueSpeed, field_paths
+from codrl_mj.actuators import Drive, Lag, ServoFriction, TorqueSpeed, field_paths
 from codrl_mj.arrays import write_motor
 from codrl_mj.arrays.written_losses import _PLACES, _THERMAL, steady_torque
 from codrl_mj.arrays.written_models import bam_torque, torque_speed_line, winding_of, winding_torque
@@ -231,6 +231,45 @@ def test_bam_gets_every_parameter_of_the_friction_model():
     )
     assert stribeck["model"] == "m2"
     assert "load_friction_motor" not in stribeck
+
+
+FRICTIONAL = CATALOGUE.replaced(
+    {"motor.gear_ratio": 20.0, "motor.coulomb_friction": 0.0, "controller.max_current": 10.0}
+).replaced({"friction": ServoFriction(0.1, 0.02, 0.15, 0.5, 1.3, 0.2, 0.1, 0.05, 0.1, 0.01, 0.02)})
+
+
+def test_the_friction_of_servos_is_written_for_bam_without_a_loss():
+    written = write_motor(FRICTIONAL, "bam")
+    values = json.loads(written.text)
+    assert values["model"] == "m6"
+    assert (values["friction_base"], values["friction_viscous"]) == (0.1, 0.02)
+    assert (values["load_friction_motor_quad"], values["dtheta_stribeck"]) == (0.01, 0.5)
+    assert not any(path.startswith("friction.") for path in lost_paths(written))
+    assert written.comparison.torque_error < 1e-11
+    assert written.comparison.motion_gap < 0.01 * written.comparison.motion_range
+    # A slide has forces and speeds of its pinion.
+    slide = json.loads(write_motor(FRICTIONAL.replaced({"motor.arm_radius": 0.05}), "bam").text)
+    assert slide["friction_base"] == pytest.approx(0.1 / 0.05)
+    assert slide["dtheta_stribeck"] == pytest.approx(0.5 * 0.05)
+    assert slide["load_friction_motor"] == 0.2
+    assert slide["load_friction_motor_quad"] == pytest.approx(0.01 * 0.05)
+
+
+@pytest.mark.parametrize("target", ["mjlab", "dcmotor"])
+def test_other_simulators_get_the_constant_friction_and_name_the_rest(target):
+    written = write_motor(FRICTIONAL, target)
+    lost = lost_paths(written)
+    assert {"friction.stribeck", "friction.load_motor", "friction.load_external_quadratic"} <= lost
+    assert "friction.base" not in lost
+    if target == "mjlab":
+        numbers = keywords(written.text)
+        assert (numbers["frictionloss"], numbers["viscous_damping"]) == (0.1, 0.02)
+    else:
+        assert 'damping="0.02" frictionloss="0.1"' in written.text
+    constant = FRICTIONAL.replaced({"friction": ServoFriction(0.1, 0.02)})
+    written = write_motor(constant, target)
+    assert not any(path.startswith("friction.") for path in lost_paths(written))
+    assert written.comparison.torque_error < 1e-9
 
 
 def test_the_voltage_and_current_to_set_in_bam_are_those_of_its_winding():

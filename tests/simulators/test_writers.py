@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import Drive, TorqueSpeed
+from codrl_mj.actuators import Drive, ServoFriction, TorqueSpeed
 from codrl_mj.arrays import write_motor
 from codrl_mj.arrays.written_losses import steady_torque
 from codrl_mj.arrays.written_models import bam_torque, torque_speed_line, winding_of
@@ -203,3 +203,19 @@ def test_bam_loads_the_file_and_computes_its_torque(tmp_path, max_current):
     losses = [model.compute_frictions(t, 0.0, s)[0] for t, s in zip(torque, speeds, strict=True)]
     net = torque - (np.array(losses) - motor.additions.friction) * np.sign(speeds)
     np.testing.assert_allclose(net, bam_torque(motor, commands, speeds), rtol=0.0, atol=1e-7)
+
+
+def test_bam_loads_the_friction_of_servos_and_computes_its_limit(tmp_path):
+    reason = "NOT RUN: BAM is not installed: pip install --no-deps better-actuator-models"
+    load_model = pytest.importorskip("bam.model", reason=reason).load_model
+
+    numbers = 0.1, 0.02, 0.15, 0.5, 1.3, 0.2, 0.1, 0.05, 0.1, 0.01, 0.02
+    friction = ServoFriction(*numbers)
+    motor = MOTORS["drive"].replaced({"motor.gear_efficiency": 1.0, "motor.coulomb_friction": 0.0})
+    file = tmp_path / "motor.json"
+    file.write_text(write_motor(motor.replaced({"friction": friction}), "bam").text)
+    model, random = load_model(str(file)), np.random.default_rng(0)
+    speeds, torques, loads = random.uniform(-3.0, 3.0, (3, 500))
+    loss, damping = model.compute_frictions(torques, loads, speeds)
+    expected = friction.limit(speeds, torques, loads)
+    np.testing.assert_allclose(loss + damping * np.abs(speeds), expected, rtol=0.0, atol=1e-9)
