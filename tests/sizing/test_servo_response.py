@@ -35,10 +35,10 @@ def test_gain_phase_and_bandwidth_are_those_of_a_mass_on_a_damped_spring():
     )
     np.testing.assert_allclose(response.gains, np.abs(answers), rtol=0.02)
     np.testing.assert_allclose(response.phases, np.unwrap(np.angle(answers)), atol=0.05)
-    fine = np.geomspace(1.0, 32.0, 10_000)
-    waves = 2j * math.pi * fine
+    grid = np.geomspace(1.0, 32.0, 10_000)
+    waves = 2j * math.pi * grid
     gains = abs(PWM.stiffness / (PWM.stiffness + total * waves**2 + waves * PWM.back_emf_damping))
-    exact = fine[np.argmax(gains < math.sqrt(0.5))]
+    exact = grid[np.argmax(gains < math.sqrt(0.5))]
     assert response.bandwidth == pytest.approx(exact, rel=0.03)
 
 
@@ -121,5 +121,7 @@ def test_motor_show_reports_a_servo_as_json(capsys):
 
 
 def test_a_register_of_an_unknown_firmware_is_refused(capsys):
-    assert main([*["motor", "show", "maxon-re65", "--family", "pwm_servo", "--position-p"], "32"]) != 0
+    assert (
+        main([*["motor", "show", "maxon-re65", "--family", "pwm_servo", "--position-p"], "32"]) != 0
+    )
     assert "set firmware to one of feetech-sts" in capsys.readouterr().err
