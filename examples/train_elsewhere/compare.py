@@ -7,12 +7,12 @@ import argparse
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 from results import Row, table, write_rows
 from swing_up import ACTUATORS, TIME_LIMIT
 from swing_up_mjx import Worlds
 
-import codrl_mj
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
 from codrl_mj.runs.policies import Policy, load_policy
@@ -35,11 +35,11 @@ class Episodes(NamedTuple):
 
 def initial_states(num: int = NUM_EPISODES) -> np.ndarray:
     """Return angles and speeds with which our engine begins its episodes, shape (2, num)."""
-    env = codrl_mj.make(TASK, ACTUATORS["ideal"])
+    env = gymnasium.make(TASK)
     states = []
     for seed in range(SEED, SEED + num):
         env.reset(seed=seed)
-        data: Any = env.unwrapped.data  # type: ignore[attr-defined]
+        data: Any = env.unwrapped.data
         states.append([data.qpos[0], data.qvel[0]])
     env.close()
     return np.array(states).T
