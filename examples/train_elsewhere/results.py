@@ -63,5 +63,7 @@ def table(rows: Iterable[Row]) -> str:
             cells.append(f"{np.mean(returns):.1f} [{min(returns):.1f}, {max(returns):.1f}]")
         gap = max(float(row["largest gap of an episode"]) for row in group)
         success = np.mean([float(row["success"]) for row in group])
-        lines.append(f"| {trained} | {tested} | {' | '.join(cells)} | {gap:.3f} | {success:.0%} |")
+        lines.append(
+            f"| {trained} | {tested} | {' | '.join(cells)} | {gap:.3f} | {100 * success:.0f} % |"
+        )
     return "\n".join(lines)

@@ -125,7 +125,6 @@ def test_the_command_of_the_page_evaluates_the_policy(example, capsys):
 
 def test_weights_of_another_trainer_become_a_policy(example, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("mine").mkdir()
     (block,) = (
         text for text in re.findall(r"```py\n(.*?)```", PAGE, re.DOTALL) if "kernel" in text
     )
@@ -134,14 +133,7 @@ def test_weights_of_another_trainer_become_a_policy(example, tmp_path, monkeypat
         tuple(jax.numpy.asarray(0.2 * generator.normal(size=size)) for size in (shape, shape[1:]))
         for shape in ((3, 64), (64, 64), (64, 1))
     ]
-    names = {
-        "layers": layers,
-        "AGENT": example.train.AGENT,
-        "save_policy": example.train.save_policy,
-        "action_space": example.worlds.action_space,
-        "Path": Path,
-    }
-    exec(block, names)
+    exec(block, {"layers": layers})
     observations = generator.normal(size=(50, 3)).astype(np.float32)
     actions, _ = load_policy(Path("mine")).predict(observations, deterministic=True)
     values = observations
