@@ -9,6 +9,7 @@ import argparse
 import csv
 import functools
 import os
+import runpy
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -183,6 +184,13 @@ def worked(path: Path) -> None:
             *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
         )
         save(figure, path)
+
+
+def trained_elsewhere(path: Path) -> None:
+    """Draw the learning curves of docs/train_elsewhere.md."""
+    results = runpy.run_path(str(DOCS.parent / "examples" / "train_elsewhere" / "results.py"))
+    rows = results["read_rows"](DOCS / "train_elsewhere_curves.csv")
+    results["draw_learning_curves"](rows, path)
 
 
 def disturbed(path: Path) -> None:
@@ -406,6 +414,7 @@ def filmed(path: Path) -> None:
 PICTURES: Mapping[str, Callable[[Path], None]] = {
     "identify_measured.svg": identified,
     "worked_examples.svg": worked,
+    "train_elsewhere.png": trained_elsewhere,
     "disturbances.svg": disturbed,
     "randomization.svg": drawn,
     "tutorial_fit.png": fitted,

@@ -32,7 +32,11 @@ PAGES = {
 """Pages written by hand. `make docs` generates the other pages of the reference from the code."""
 NOT_CLONED = {"docs/reference/settings.md", "docs/reference/command_line.md"}
 """Generated pages, which are not in a clone."""
-TUTORIALS = {"docs/tutorial_log_to_policy.md", "docs/tutorial_datasheet_to_board.md"}
+TUTORIALS = {
+    "docs/tutorial_log_to_policy.md",
+    "docs/tutorial_datasheet_to_board.md",
+    "docs/train_elsewhere.md",
+}
 """Pages whose commands have their own tests."""
 TESTED_SEPARATELY = ("own_robot", "training", "other_agents", "randomization")
 WITH_OTHER_TESTS = {"README.md", *TUTORIALS, *(f"docs/{name}.md" for name in TESTED_SEPARATELY)}
