@@ -246,10 +246,14 @@ def test_deadband_start_and_counts_shape_the_duty_cycle():
         -5.5 * count
     )
     started = Bench(servo(start_duty=0.016, **loop))
-    assert [started.step(0.0, place)[1].duty for place in (0.0, 1e-4, 0.1)] == [0.0, -0.016, -0.5]
+    assert [started.step(0.0, position)[1].duty for position in (0.0, 1e-4, 0.1)] == [
+        0.0,
+        -0.016,
+        -0.5,
+    ]
     counted = Bench(servo(encoder_counts=4096.0, **loop))
-    places = [0.49 * count, 0.51 * count, 7.4 * count]
-    assert [counted.step(0.0, place)[1].duty for place in places] == pytest.approx(
+    positions = [0.49 * count, 0.51 * count, 7.4 * count]
+    assert [counted.step(0.0, position)[1].duty for position in positions] == pytest.approx(
         [0.0, -5.0 * count, -35.0 * count]
     )
 

@@ -35,10 +35,10 @@ def test_gain_phase_and_bandwidth_are_those_of_a_mass_on_a_damped_spring():
     )
     np.testing.assert_allclose(response.gains, np.abs(answers), rtol=0.02)
     np.testing.assert_allclose(response.phases, np.unwrap(np.angle(answers)), atol=0.05)
-    fine = np.geomspace(1.0, 32.0, 10_000)
-    waves = 2j * math.pi * fine
+    grid = np.geomspace(1.0, 32.0, 10_000)
+    waves = 2j * math.pi * grid
     gains = abs(PWM.stiffness / (PWM.stiffness + total * waves**2 + waves * PWM.back_emf_damping))
-    exact = fine[np.argmax(gains < math.sqrt(0.5))]
+    exact = grid[np.argmax(gains < math.sqrt(0.5))]
     assert response.bandwidth == pytest.approx(exact, rel=0.03)
 
 
