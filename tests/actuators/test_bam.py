@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import codrl_mj
 from codrl_mj.actuators import Drive, PwmServo, Servo, ServoFriction, resolve
 from codrl_mj.actuators.bam import LAWS, bam_friction
 from tests.actuators.test_servo_friction import MODELS
@@ -196,3 +197,58 @@ def test_a_servo_moves_as_in_bams_simulation(tmp_path, name):
 def only_constant(friction):
     """Return friction with Coulomb's term alone."""
     return ServoFriction(base=friction.base)
+
+
+TWO_JOINTS = """
+<mujoco>
+  <option timestep="0.001" gravity="0 0 -9.80665" noslip_iterations="1"/>
+  <worldbody>
+    <body>
+      <joint name="a" axis="0 1 0"/>
+      <inertial pos="0 0 -0.06" mass="0.06" diaginertia="1e-4 1e-4 1e-4"/>
+      <body pos="0 0 -0.12">
+        <joint name="b" axis="0 1 0"/>
+        <inertial pos="0 0 -0.06" mass="0.05" diaginertia="1e-4 1e-4 1e-4"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="a" joint="a"/><motor name="b" joint="b"/></actuator>
+</mujoco>
+"""
+
+
+def test_an_arm_of_two_servos_moves_as_under_bams_controller_in_mujoco(tmp_path):
+    """BAM's load is that of the joint alone; ours includes the motion of the other joint."""
+    reason = "NOT RUN: BAM is not installed: pip install --no-deps better-actuator-models"
+    pytest.importorskip("bam.model", reason=reason)
+    from bam.model import load_model
+    from bam.mujoco import MujocoController
+
+    theirs = load_model(motor_name="xl330", model="m6")
+    numbers = {key: number.value for key, number in theirs.get_parameters().items()}
+    (tmp_path / "m6.json").write_text(json.dumps(numbers | {"model": "m6", "actuator": "xl330"}))
+    servo = resolve(tmp_path / "m6.json", None, "the test")
+    times = 0.001 * np.arange(1500)
+    first, second = 0.8 * np.sin(np.pi * times), 0.6 * np.sin(5.0 * times) + 0.5 * (times > 1.0)
+    targets = np.stack([first, second], axis=1)
+    model = mujoco.MjModel.from_xml_string(TWO_JOINTS)
+    data, expected = mujoco.MjData(model), []
+    controller = MujocoController(theirs, ["a", "b"], model, data)
+    for target in targets:
+        expected.append(data.qpos.copy())
+        controller.q_target[:] = target
+        controller.update()
+        mujoco.mj_step(model, data)
+    gaps = []
+    for friction in (servo.friction, only_constant(servo.friction)):
+        spec = mujoco.MjSpec.from_string(TWO_JOINTS)
+        motors = {"a|b": servo.replaced({"friction": friction})}
+        model, angles = codrl_mj.add_motors(spec, motors).compile(), []
+        data = mujoco.MjData(model)
+        for target in targets:
+            angles.append(data.qpos.copy())
+            data.ctrl[:] = target
+            mujoco.mj_step(model, data)
+        gaps.append((np.abs(np.array(angles) - expected) / np.ptp(expected, axis=0)).max())
+    assert gaps[0] < 0.003
+    assert gaps[1] > 10.0 * gaps[0]
