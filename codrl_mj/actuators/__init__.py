@@ -52,7 +52,8 @@ from codrl_mj.actuators.parameters import (
     parameter_paths,
     parameters_type,
 )
-from codrl_mj.actuators.pwm_servo import PwmLoop, PwmServo
+from codrl_mj.actuators.pwm_loop import PwmLoop
+from codrl_mj.actuators.pwm_servo import PwmServo
 from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
 from codrl_mj.actuators.servo_friction import ServoFriction

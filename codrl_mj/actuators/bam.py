@@ -18,7 +18,8 @@ from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.drive import Drive
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.parameters import FieldValue
-from codrl_mj.actuators.pwm_servo import PwmLoop, PwmServo
+from codrl_mj.actuators.pwm_loop import PwmLoop
+from codrl_mj.actuators.pwm_servo import PwmServo
 from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
 from codrl_mj.actuators.servo_friction import ServoFriction

@@ -24,7 +24,7 @@ class Firmware(NamedTuple):
     encoder_counts: float
     """Counts per turn of the output shaft."""
     source: str
-    """Where these values are from, and what contradicts them."""
+    """Sources of these values, and their contradictions."""
 
 
 FIRMWARES: dict[str, Firmware] = {

@@ -14,116 +14,28 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import drive, noise, shaft, stability
+from codrl_mj.actuators import drive, shaft, stability
 from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.firmware import FIRMWARES, find_firmware
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.geared import Geared, has_single_friction
 from codrl_mj.actuators.model import Command, Inputs, UnstableError
 from codrl_mj.actuators.parameters import Parameters
+from codrl_mj.actuators.pwm_loop import (
+    HISTORY,
+    SLACK,
+    Commands,
+    LoopState,
+    PwmLoop,
+    advance_loop,
+    command_in_force,
+)
 from codrl_mj.actuators.servo_friction import ServoFriction, has_servo_friction
 from codrl_mj.actuators.shaft import Shaft, TemperatureRises
-from codrl_mj.fields import Checked, choice, optional_nested, real
+from codrl_mj.fields import optional_nested
 
-HISTORY = 8
-"""Number of commands that are on their way at the same time, at most."""
-SLACK = 1e-3
-"""Share of a step by which times may be off and still count as equal. Times in float32 need it."""
 MAX_PIECES = 64
 """Largest number of pieces with a constant speed between two samples of the servo."""
-
-
-@dataclasses.dataclass(frozen=True)
-class PwmLoop(Checked):
-    """Position loop of a servo that sets a duty cycle, and the bus that brings its commands.
-
-    Angles are those of the output shaft: a hinge, or the wheel on a slide.
-
-    Raises:
-        ValueError: a field is out of bounds.
-    """
-
-    position_gain: float = real(5.0, above=0.0, unit="1/rad")
-    """Duty cycle for a position error of 1 rad, > 0; 1 is the whole voltage of the supply. If you
-    specify `position_p` or `stiffness`, the servo computes it.
-    """
-    position_p: float = real(0.0, minimum=0.0)
-    """Position gain as the value of the register P of the `firmware`, >= 0. The servo converts it
-    to `position_gain` and sets it to 0.
-    """
-    stiffness: float = real(0.0, minimum=0.0, unit="N*m/rad")
-    """Position gain as the torque [N*m] of the motor at the output for a position error of 1 rad at
-    standstill, without the gear's losses, >= 0. The servo converts it to `position_gain` and sets
-    it to 0.
-    """
-    firmware: str = choice("unknown", "unknown", *FIRMWARES)
-    """Product line of the servo, which tells the meaning of `position_p`. A motor of the catalogue
-    that becomes a servo sets it.
-    """
-    integral_gain: float = real(0.0, minimum=0.0, unit="1/(rad*s)")
-    """Duty cycle that a position error of 1 rad adds in a second, >= 0. The integral stops while
-    the duty cycle is at its limit.
-    """
-    derivative_gain: float = real(0.0, minimum=0.0, unit="s/rad")
-    """Duty cycle for a position error that grows by 1 rad/s, >= 0."""
-    servo_rate: float = real(1e3, above=0.0, unit="Hz")
-    """Sample rate [Hz] of the position loop, > 0; it must be a multiple or a divisor of the
-    mechanical step's rate.
-    """
-    max_duty: float = real(1.0, above=0.0, maximum=1.0)
-    """Largest duty cycle, in (0, 1]."""
-    start_duty: float = real(0.0, minimum=0.0, maximum=1.0)
-    """Smallest duty cycle other than 0, in [0, 1]: a smaller one is raised to it, so that the motor
-    overcomes its friction.
-    """
-    deadband: float = real(0.0, minimum=0.0, unit="rad")
-    """Position error [rad] up to which the loop sees none, >= 0."""
-    encoder_counts: float = real(0.0, minimum=0.0, unit="1/turn")
-    """Counts of the encoder per turn of the output shaft, >= 0; 0: exact positions."""
-    max_velocity: float = real(math.inf, above=0.0, unit="rad/s", infinite=True)
-    """Largest speed [rad/s] at which the target moves towards the command, > 0."""
-    max_acceleration: float = real(math.inf, above=0.0, unit="rad/s^2", infinite=True)
-    """Largest acceleration [rad/s^2] of the target, > 0."""
-    command_rate: float = real(1e4, above=0.0, unit="Hz")
-    """Rate [Hz] at which commands are sent to the servo, > 0; at most one per mechanical step. The
-    servo keeps a command until the next one arrives.
-    """
-    command_delay: float = real(0.0, minimum=0.0, unit="s")
-    """Time [s] from sending a command to its arrival, >= 0; at most seven periods of the command
-    rate. Until the first command arrives, the servo holds its position.
-    """
-    command_jitter: float = real(0.0, minimum=0.0, unit="s")
-    """Standard deviation [s] of that time from command to command, >= 0; normally distributed, but
-    no command arrives before it is sent. A newer command replaces an older one that is still on its
-    way.
-    """
-    max_position: float = real(math.pi, above=0.0, unit="rad")
-    """Largest position [rad] that an agent can command, > 0."""
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        super().__post_init__()
-        if self.start_duty > self.max_duty:
-            raise ValueError(
-                f"PwmLoop.start_duty = {self.start_duty:g}: must be <= max_duty = {self.max_duty:g}"
-            )
-        if self.position_p and self.stiffness:
-            raise ValueError(
-                f"PwmLoop.position_p = {self.position_p:g} and stiffness = {self.stiffness:g}: are"
-                " two values of the same gain; set one of them"
-            )
-        if self.position_p and self.firmware == "unknown":
-            raise ValueError(
-                f"PwmLoop.position_p = {self.position_p:g}: the meaning of this register depends on"
-                f" the product line; set firmware to one of {', '.join(FIRMWARES)}, or specify"
-                " position_gain [duty cycle per rad] or stiffness [N*m/rad] instead"
-            )
-
-    @property
-    def register_p(self) -> float | None:
-        """Value of the register P that gives `position_gain`; None if the firmware is unknown."""
-        law = FIRMWARES.get(self.firmware)
-        return None if law is None else self.position_gain / law.gain_per_p
 
 
 class State(NamedTuple):
@@ -196,32 +108,6 @@ class Signals(NamedTuple):
     """Mean heat [W] in the winding."""
 
 
-class Commands(NamedTuple):
-    """The last commands [rad] at the output shaft, the newest first."""
-
-    c1: float
-    c2: float
-    c3: float
-    c4: float
-    c5: float
-    c6: float
-    c7: float
-    c8: float
-
-
-class Sample(NamedTuple):
-    """Result of a sample of the position loop."""
-
-    duty: float
-    """Duty cycle."""
-    error: float
-    """Position error [rad]."""
-    integral: float
-    """Duty cycle of the integral part."""
-    saturated: float
-    """1 if the duty cycle is limited."""
-
-
 class Driven(NamedTuple):
     """Winding after some time of a constant duty cycle and speed."""
 
@@ -233,19 +119,27 @@ class Driven(NamedTuple):
     """Mean squared current [A^2]."""
 
 
-class Averages(NamedTuple):
-    """Rotor and winding after a period, and averages over it."""
+class StepMotion(NamedTuple):
+    """Motor and shaft within a step, and sums over the periods between the samples so far."""
 
     current: float
-    """Current [A] at the end."""
+    """Current [A]."""
+    position: float
+    """Position [rad] of the output shaft."""
     speed: float
-    """Speed [rad/s] of the rotor at the end."""
-    mean: float
-    """Mean current [A]."""
+    """Speed [rad/s] of the rotor."""
+    mean_current: float
+    """Mean current [A], multiplied by the share of the step so far, as all further entries."""
     mean_square: float
     """Mean squared current [A^2]."""
+    duty: float
+    """Mean duty cycle."""
+    voltage: float
+    """Mean terminal voltage [V]."""
+    power: float
+    """Mean of voltage times current [W]."""
     torque: float
-    """Torque [N*m] that the gear delivers, converted to the rotor's side."""
+    """Mean torque [N*m] that the gear delivers, converted to the rotor's side."""
 
 
 def sent_commands(state: State, command: float, position: float, is_new: bool) -> Commands:
@@ -259,82 +153,6 @@ def sent_commands(state: State, command: float, position: float, is_new: bool) -
             command, state.c1, state.c2, state.c3, state.c4, state.c5, state.c6, state.c7
         )
     return Commands(state.c1, state.c2, state.c3, state.c4, state.c5, state.c6, state.c7, state.c8)
-
-
-def command_in_force(
-    parameters: Parameters,
-    timestep: float,
-    commands: Commands,
-    newest: int,
-    time: float,
-    noise_key: float,
-) -> float:
-    """Return the newest command [rad] that has arrived at a time [s]; else the oldest one."""
-    interval = max(1.0 / parameters.command_rate, timestep)
-    for age in range(HISTORY):
-        number = max(newest - age, 0)
-        # A command is sent at the first step that does not begin before its time.
-        sent = math.ceil(number * interval / timestep - SLACK) * timestep
-        delay = parameters.command_delay
-        if parameters.command_jitter > 0.0:
-            delay += parameters.command_jitter * noise.standard_normal(noise_key, number, 0)
-        if sent + max(delay, 0.0) <= time + SLACK * timestep:
-            return commands[age]
-    return commands.c8
-
-
-def advance_target(
-    parameters: Parameters, period: float, target: float, velocity: float, command: float
-) -> tuple[float, float]:
-    """Move the target [rad] towards the command for a period [s]; return it and its speed.
-
-    The speed is the largest from which the target can stop at the command. With the speed v in this
-    sample and a*T less in each following one, it comes to a stop after v^2/(2*a) + v*T/2.
-    """
-    distance, acceleration = command - target, parameters.max_acceleration
-    speed = min(parameters.max_velocity, abs(distance) / period)
-    if acceleration == math.inf:
-        wanted = math.copysign(speed, distance)
-    else:
-        half = 0.5 * acceleration * period
-        stopping = math.sqrt(half * half + 2.0 * acceleration * abs(distance)) - half
-        wanted = math.copysign(min(speed, stopping), distance)
-        wanted = min(max(wanted, velocity - 2.0 * half), velocity + 2.0 * half)
-    # The last sample has the rest of the way, at up to a*T more than the largest change of speed.
-    slow = acceleration == math.inf or abs(wanted) <= 2.0 * acceleration * period
-    if slow and wanted * distance >= 0.0 and abs(wanted) * period >= abs(distance):
-        return command, distance / period
-    return target + period * wanted, wanted
-
-
-def sample_loop(
-    parameters: Parameters,
-    period: float,
-    target: float,
-    position: float,
-    error_before: float,
-    integral: float,
-    is_first: bool,
-) -> Sample:
-    """Return the duty cycle for a target and a position [rad] of the output shaft."""
-    measured = position
-    if parameters.encoder_counts > 0.0:
-        count = 2.0 * math.pi / parameters.encoder_counts
-        measured = count * math.floor(position / count + 0.5)
-    error = target - measured
-    if abs(error) <= parameters.deadband:
-        error = 0.0
-    rate = 0.0 if is_first else (error - error_before) / period
-    integral_after = integral + parameters.integral_gain * error * period
-    wanted = parameters.position_gain * error + parameters.derivative_gain * rate + integral_after
-    if wanted != 0.0 and abs(wanted) < parameters.start_duty:
-        wanted = math.copysign(parameters.start_duty, wanted)
-    duty = min(max(wanted, -parameters.max_duty), parameters.max_duty)
-    saturated = 1.0 if duty != wanted else 0.0
-    # The integral stops while the duty cycle is at its limit, unless this moves it off the limit.
-    if saturated > 0.0 and (integral_after - integral) * wanted > 0.0:
-        integral_after = integral
-    return Sample(duty, error, integral_after, saturated)
 
 
 def advance_winding(
@@ -365,15 +183,15 @@ def advance_motor(
     parameters: Parameters,
     resistance: float,
     duration: float,
-    current: float,
+    share: float,
     duty: float,
-    speed: float,
+    motion: StepMotion,
     rotor: Shaft,
-) -> Averages:
-    """Advance winding and rotor for some time [s] at a constant duty cycle.
+) -> StepMotion:
+    """Advance winding and rotor for some time [s], a share of the step, at a constant duty cycle.
 
-    The rotor is that at the beginning of the step, and has `speed` now. The time is divided into
-    pieces with a constant speed, as in `shaft.advance_motor`.
+    The rotor is that at the beginning of the step. The time is divided into pieces with a constant
+    speed, as in `shaft.advance_motor`.
     """
     viscous = parameters.viscous_friction
     braking = (
@@ -384,6 +202,7 @@ def advance_motor(
     pieces = min(max(math.ceil(2.0 * duration * braking / rotor.inertia), 1), MAX_PIECES)
     has_losses = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
     is_servo = has_servo_friction(parameters)
+    current, speed = motion.current, motion.speed
     mean, mean_square, torque = 0.0, 0.0, 0.0
     piece = duration / pieces
     for _ in range(pieces):
@@ -400,7 +219,19 @@ def advance_motor(
         # The external acceleration includes the viscous friction at the step's initial speed.
         net_torque = delivered - viscous * (speed - rotor.speed)
         speed += piece * (net_torque / rotor.inertia + rotor.external_acceleration)
-    return Averages(current, speed, mean, mean_square, torque)
+    way = 0.5 * duration * (motion.speed + speed) / parameters.gear_ratio
+    driving, lost = duty * parameters.supply_voltage, duty * duty * parameters.supply_resistance
+    return StepMotion(
+        current,
+        motion.position + way,
+        speed,
+        motion.mean_current + share * mean,
+        motion.mean_square + share * mean_square,
+        motion.duty + share * duty,
+        motion.voltage + share * (driving - lost * mean),
+        motion.power + share * (driving * mean - lost * mean_square),
+        motion.torque + share * torque,
+    )
 
 
 def advance(
@@ -411,96 +242,83 @@ def advance(
     `inputs.desired_torque` is a commanded position [rad] of the rotor.
     """
     ratio, is_first = parameters.gear_ratio, state.expected_time <= 0.0
-    heat = TemperatureRises(state.winding_rise, state.housing_rise)
     rotor = drive.begin_shaft(parameters, timestep, state, inputs)
+    heat = TemperatureRises(state.winding_rise, state.housing_rise)
     temperature = shaft.temperature_of(parameters, heat)
     resistance = shaft.resistance_at(parameters, temperature)
     is_hot = 1.0 if temperature > parameters.max_temperature else 0.0
     newest = int(inputs.time / max(1.0 / parameters.command_rate, timestep) + SLACK)
     is_new = is_first or newest + 1.0 > state.sent
-    sent = newest + 1.0 if is_new else state.sent
     start = inputs.position / ratio
     commands = sent_commands(state, inputs.desired_torque / ratio, start, is_new)
     count = max(int(timestep * parameters.servo_rate + 0.5), 1)
     steps_per_sample = max(int(1.0 / (timestep * parameters.servo_rate) + 0.5), 1)
-    period = timestep / count
+    period, steps_to_sample, in_force = timestep / count, state.steps_to_sample, start
     target = start if is_first else state.target
-    velocity, duty = state.target_velocity, state.duty
-    error, integral, steps_to_sample = state.error, state.integral, state.steps_to_sample
-    current, position, speed = state.current, start, inputs.speed
-    in_force, saturated, mean_duty = start, 0.0, 0.0
-    amperes, volts, torque, power, square = 0.0, 0.0, 0.0, 0.0, 0.0
+    loop = LoopState(target, state.target_velocity, state.error, state.integral, state.duty, 0.0)
+    motion = StepMotion(state.current, start, inputs.speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for index in range(count):
         # If the loop is faster than the mechanical step, all `count` passes are samples.
         if steps_to_sample <= 0.0 or count > 1:
-            sample_time = period * steps_per_sample
+            time = inputs.time + index * period
             command = command_in_force(
-                parameters,
-                timestep,
-                commands,
-                newest,
-                inputs.time + index * period,
-                inputs.noise_key,
+                parameters, timestep, commands, newest, time, inputs.noise_key
             )
             in_force = command if index == 0 else in_force
-            target, velocity = advance_target(parameters, sample_time, target, velocity, command)
-            sample = sample_loop(
-                parameters, sample_time, target, position, error, integral, is_first and index == 0
+            loop = advance_loop(
+                parameters,
+                period * steps_per_sample,
+                loop,
+                command,
+                motion.position,
+                is_first and index == 0,
             )
-            duty, error, integral = sample.duty, sample.error, sample.integral
-            saturated = max(saturated, sample.saturated)
             steps_to_sample = float(steps_per_sample)
-        duty = 0.0 if is_hot > 0.0 else duty
-        moved = advance_motor(parameters, resistance, period, current, duty, speed, rotor)
-        position += 0.5 * period * (speed + moved.speed) / ratio
-        current, speed = moved.current, moved.speed
-        lost = duty * duty * parameters.supply_resistance
-        amperes, mean_duty = amperes + moved.mean / count, mean_duty + duty / count
-        driving = duty * parameters.supply_voltage
-        volts += (driving - lost * moved.mean) / count
-        power += (driving * moved.mean - lost * moved.mean_square) / count
-        torque, square = torque + moved.torque / count, square + moved.mean_square / count
-    loss = resistance * square
+        duty = 0.0 if is_hot > 0.0 else loop.duty
+        motion = advance_motor(parameters, resistance, period, 1.0 / count, duty, motion, rotor)
+    loss = resistance * motion.mean_square
     if shaft.has_thermal_model(parameters):
         heat = shaft.rises_after(parameters, timestep, heat, loss)
-    signals = Signals(
-        amperes,
-        mean_duty,
-        volts,
-        shaft.temperature_of(parameters, heat),
-        target,
-        in_force - start,
-        max(saturated, is_hot),
-        saturated,
-        is_hot,
-        power,
-        loss,
+    return (
+        State(
+            motion.current,
+            heat.winding,
+            heat.housing,
+            motion.torque / rotor.inertia,
+            inputs.speed,
+            rotor.external_acceleration,
+            inputs.time + timestep,
+            loop.target,
+            loop.target_velocity,
+            loop.error,
+            loop.integral,
+            loop.duty,
+            steps_to_sample - 1.0,
+            newest + 1.0 if is_new else state.sent,
+            commands.c1,
+            commands.c2,
+            commands.c3,
+            commands.c4,
+            commands.c5,
+            commands.c6,
+            commands.c7,
+            commands.c8,
+        ),
+        motion.torque,
+        Signals(
+            motion.mean_current,
+            motion.duty,
+            motion.voltage,
+            shaft.temperature_of(parameters, heat),
+            loop.target,
+            in_force - start,
+            max(loop.saturated, is_hot),
+            loop.saturated,
+            is_hot,
+            motion.power,
+            loss,
+        ),
     )
-    after = State(
-        current,
-        heat.winding,
-        heat.housing,
-        torque / rotor.inertia,
-        inputs.speed,
-        rotor.external_acceleration,
-        inputs.time + timestep,
-        target,
-        velocity,
-        error,
-        integral,
-        duty,
-        steps_to_sample - 1.0,
-        sent,
-        commands.c1,
-        commands.c2,
-        commands.c3,
-        commands.c4,
-        commands.c5,
-        commands.c6,
-        commands.c7,
-        commands.c8,
-    )
-    return after, torque, signals
 
 
 def observe(
@@ -596,8 +414,8 @@ class PwmServo(Geared):
             motor: name of a motor of the catalogue, or of a file.
             loop_fields: settings of the loop that the user has specified.
         """
-        found = find_firmware(motor)
-        name = str(loop_fields.get("firmware", found[0] if found else "unknown"))
+        factory = find_firmware(motor)
+        name = str(loop_fields.get("firmware", factory[0] if factory else "unknown"))
         if name not in FIRMWARES:
             return {}
         law = FIRMWARES[name]
@@ -607,8 +425,8 @@ class PwmServo(Geared):
             "encoder_counts": law.encoder_counts,
         }
         is_set = {"position_gain", "position_p", "stiffness"} & loop_fields.keys()
-        if found is not None and found[0] == name and not is_set:
-            settings["position_p"] = found[1]
+        if factory is not None and factory[0] == name and not is_set:
+            settings["position_p"] = factory[1]
         return settings
 
     @property

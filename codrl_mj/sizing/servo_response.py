@@ -49,7 +49,7 @@ class ServoTrace(NamedTuple):
 
 
 class ServoResponse(NamedTuple):
-    """What a servo does with a load."""
+    """Responses of a servo with a load."""
 
     inertia: float
     """Inertia [kg*m^2] of the load at the output, without the rotor's."""
@@ -209,7 +209,9 @@ class _Bench:
         steps = round((before + during) / frequency / self.timestep)
         turn = 2.0 * math.pi * frequency * self.timestep * np.arange(steps)
         position = self.run(AMPLITUDE * np.sin(turn)).position
-        kept = slice(steps - round(during / frequency / self.timestep), None)
-        waves = np.stack([np.sin(turn[kept]), np.cos(turn[kept]), np.ones(len(turn[kept]))], 1)
-        real, imaginary, _ = np.linalg.lstsq(waves, position[kept], rcond=None)[0]
+        measured = slice(steps - round(during / frequency / self.timestep), None)
+        waves = np.stack(
+            [np.sin(turn[measured]), np.cos(turn[measured]), np.ones(len(turn[measured]))], 1
+        )
+        real, imaginary, _ = np.linalg.lstsq(waves, position[measured], rcond=None)[0]
         return complex(real, imaginary) / AMPLITUDE
