@@ -71,7 +71,7 @@ NO_GPU = (
     "the graph was a recording of Warp on the CPU, not a CUDA graph",
     "the times are those of a CPU, and of fewer worlds",
 )
-"""What a dry run leaves out."""
+"""Limits of a dry run."""
 
 
 class Sizes(NamedTuple):

@@ -32,7 +32,7 @@ torque.
 """
 _RECORD_SIZE = 5
 REPEATED, NEXT, AT_REST = range(3)
-"""What a call does: it repeats the last step, goes on to the next one, or begins at rest."""
+"""Kinds of calls: a call repeats the last step, takes the one after it, or begins at rest."""
 _LINE_SIZE = 128
 """Number of bytes that a GPU reads at once; a CPU reads half of it."""
 _NEVER = 1e30
@@ -56,7 +56,7 @@ class StepArrays(NamedTuple):
     """Inertia at each actuator [kg*m^2] or [kg], shape (worlds or 1, columns); None if unknown."""
 
 
-class Table:
+class LaneTable:
     """Numbers of all actuators on a device, some per actuator.
 
     Args:
@@ -164,10 +164,10 @@ class WarpActuators:
         self._unknown_inertia = wp.full((1, 1), math.inf, dtype=self._edge, device=self.device)
         self._stages = 4 if holds_stages else 1
 
-    def _table(self, num_entries: int, num_rows: int) -> Table:
+    def _table(self, num_entries: int, num_rows: int) -> LaneTable:
         """Return a table for all actuators in some worlds."""
         shape = num_rows, len(self.actuators)
-        return Table(num_entries, shape, self._scalar, self.device)
+        return LaneTable(num_entries, shape, self._scalar, self.device)
 
     def _array(self, values: object) -> Array:
         """Return an array on the device."""
