@@ -9,10 +9,12 @@ import time
 from pathlib import Path
 
 import imageio
+import numpy as np
 import pytest
 
 import benchmark
 import benchmark_training
+import simulator_speed
 import worked_examples
 from codrl_mj.actuators import IDEAL
 from codrl_mj.runs.policies import load_policy
@@ -127,6 +129,29 @@ def test_the_page_of_training_speed_follows_from_its_rows():
     page = benchmark_training.PAGE.read_text()
     assert page.partition(benchmark_training.WRITTEN)[2] == f"\n\n{written}"
     assert "5.8 (9 of 10)" in written
+
+
+def test_the_tables_of_other_simulators_follow_from_their_rows(tmp_path):
+    page = shutil.copy(simulator_speed.PAGE, tmp_path)
+    simulator_speed.write_tables(page=Path(page))
+    assert Path(page).read_text() == simulator_speed.PAGE.read_text()
+    ratios = {
+        (row["group"].split(",")[-1].strip(), row["member"]): float(row["median"])
+        for row in read_csv(simulator_speed.ROWS)
+    }
+    assert len(ratios) == len(read_csv(simulator_speed.ROWS))
+    assert ratios["the same in all worlds", "Warp, double"] < 1.5
+    assert ratios["three numbers drawn per drive", "Warp, double"] < 2.2
+    assert ratios["256 worlds", "six motors, double"] < 1.15
+
+
+def test_the_interval_of_a_median():
+    values = np.random.default_rng(0).permutation(25).astype(float)
+    assert simulator_speed.median_interval(values) == (12.0, 7.0, 17.0)
+    draws = np.random.default_rng(1).exponential(size=(2000, 25))
+    intervals = [simulator_speed.median_interval(row) for row in draws]
+    inside = np.mean([low <= np.log(2.0) <= high for _, low, high in intervals])
+    assert 0.94 < inside < 0.98
 
 
 def test_from_a_bench_log_to_a_policy(tmp_path):

@@ -6,6 +6,7 @@ have finished; finished entries keep their values.
 
 import functools
 import importlib
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeGuard, cast
 
@@ -308,16 +309,25 @@ def advance(
     _check_arrays(array_module, named)
     arrays = [array for _, array in named]
     shape = np.broadcast_shapes(*(tuple(array.shape) for array in arrays))
-    backend = ArrayCode(array_module, arrays[0], shape, max_iterations)
-    symbols = [{name: _symbol(value) for name, value in part.items()} for part in parts]
+    # JAX on a CPU takes up to twice as long for rows that are no multiple of its vectors.
+    backend = ArrayCode(array_module, arrays[0], (math.prod(shape),), max_iterations)
+
+    def symbol(value: object) -> object:
+        return Scalar("float", _flat(array_module, value, shape)) if _is_array(value) else value
+
+    symbols = [{name: symbol(value) for name, value in part.items()} for part in parts]
     # Infinity and NaN are results here, as in compiled code: the other side of a branch is computed
     # with numbers that it was not written for.
     with np.errstate(all="ignore"):
         result = read_advance(family, backend, symbols[0], timestep, *symbols[1:])
+
+    def shaped(array: Array) -> Array:
+        return backend.full(array).reshape(shape)
+
     return Advanced(
-        family.State(*map(backend.full, result.state)),
-        backend.full(result.torque),
-        family.Signals(*map(backend.full, result.signals)),
+        family.State(*map(shaped, result.state)),
+        shaped(result.torque),
+        family.Signals(*map(shaped, result.signals)),
     )
 
 
@@ -380,6 +390,8 @@ def _check_arrays(array_module: ArrayModule, named: list[tuple[str, Array]]) -> 
             )
 
 
-def _symbol(value: object) -> object:
-    """Return the symbol of an array; a float remains a constant."""
-    return Scalar("float", value) if _is_array(value) else value
+def _flat(array_module: ArrayModule, array: Array, shape: tuple[int, ...]) -> Array:
+    """Return an array of a common shape as one row; a single number remains one."""
+    if math.prod(array.shape) == 1:
+        return array.reshape(())
+    return array_module.broadcast_to(array, shape).reshape(-1)

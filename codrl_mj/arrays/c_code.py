@@ -4,6 +4,7 @@ Every intermediate result is a constant with its own name, and every loop has it
 text uses doubles and 64-bit integers, and computes exactly what the source computes in Python.
 """
 
+import inspect
 import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -269,6 +270,29 @@ _REPLACEMENTS: dict[str, Callable[..., str]] = {
 }
 
 
+def replacement_functions(real: Real, statements: Sequence[str]) -> list[str]:
+    """Return C++ functions for those that Warp lacks on a CPU and that statements call.
+
+    The functions are lambdas, so that other functions may contain them. A compiler would compute
+    the formulas for all actuators, also where a branch is not taken, if they were in its place.
+    """
+    suffix, functions = "f" if real == "float" else "", []
+    for name, replacement in _REPLACEMENTS.items():
+        if any(re.search(rf"\b{name}{suffix}\(", line) for line in statements):
+            backend = CCode(portable=True, real=real)
+            _, *arguments = inspect.signature(replacement).parameters
+            result = replacement(backend, *arguments)
+            declared = ", ".join(f"{real} {argument}" for argument in arguments)
+            head = f"[]({declared}) __attribute__((noinline)) -> {real}"
+            functions += [
+                f"const auto {name}{suffix} = {head} {{",
+                *backend.lines,
+                f"    return {result};",
+                "};",
+            ]
+    return functions
+
+
 class CProgram(NamedTuple):
     """A family's `advance` as C: statements, and the expressions of their results.
 
@@ -291,6 +315,7 @@ def c_program(
     portable: bool = False,
     real: Real = "double",
     variables: Collection[str] = (),
+    timestep: float | None = None,
 ) -> CProgram:
     """Return a family's `advance` as statements of C, for a function or a kernel around them.
 
@@ -299,6 +324,7 @@ def c_program(
         portable: True to call only functions that Warp has on a CPU; see `CCode`.
         real: type of floats. In 32 bits a noise key is exact below 2**24 only.
         variables: names of parameters that become no constants, as in `parameters_type`.
+        timestep: mechanical step [s], which becomes a constant; None leaves it a variable.
 
     Raises:
         UnsupportedError: the source contains a construct that the reader does not take.
@@ -317,7 +343,7 @@ def c_program(
         family,
         backend,
         parameters,
-        Scalar("float", "timestep"),
+        Scalar("float", "timestep") if timestep is None else timestep,
         _symbols("s", family.State._fields),
         _symbols("x", Inputs._fields),
     )

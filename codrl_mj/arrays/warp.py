@@ -16,7 +16,7 @@ import warp as wp
 
 from codrl_mj.actuators import ActuatorModel, parameter_paths, parameters_type
 from codrl_mj.actuators.noise import MAX_KEY
-from codrl_mj.arrays.c_code import Real, c_program
+from codrl_mj.arrays.c_code import Real, c_program, replacement_functions
 from codrl_mj.fields import check_names
 
 # Warp is not followed by the type checker.
@@ -31,6 +31,10 @@ TIME, STEPS, POSITION, SPEED, TORQUE = range(5)
 torque.
 """
 _RECORD_SIZE = 5
+REPEATED, NEXT, AT_REST = range(3)
+"""Kinds of calls: a call repeats the last step, takes the one after it, or begins at rest."""
+_LINE_SIZE = 128
+"""Number of bytes that a GPU reads at once; a CPU reads half of it."""
 _NEVER = 1e30
 """Time in the record of a world that must be brought to rest in the next call."""
 
@@ -50,6 +54,36 @@ class StepArrays(NamedTuple):
     """Delivered force, which is written, shape (worlds, columns); it may be `desired`."""
     inertia: Array = None
     """Inertia at each actuator [kg*m^2] or [kg], shape (worlds or 1, columns); None if unknown."""
+
+
+class LaneTable:
+    """Numbers of all actuators on a device, some per actuator.
+
+    Args:
+        num_entries: number of entries per actuator.
+        shape: number of worlds, or 1 if they have the same numbers, and of actuators.
+        scalar: Warp's type of the numbers.
+        device: the device.
+    """
+
+    def __init__(
+        self, num_entries: int, shape: tuple[int, int], scalar: Any, device: Device
+    ) -> None:
+        """Create a table of zeros."""
+        self._shape, self._size = shape, shape[0] * shape[1]
+        line = _LINE_SIZE // np.dtype(wp.dtype_to_numpy(scalar)).itemsize
+        # An odd number of lines: a CPU keeps only a few numbers whose addresses differ by a
+        # multiple of 4,096 bytes in its cache, and the entries of an actuator would be such.
+        self.stride = (-(-self._size // line) | 1) * line
+        """Distance between two entries of the same actuator."""
+        # Warp has no empty arrays of data that kernels may read.
+        self.array: Array = wp.zeros(max(num_entries, 1) * self.stride, dtype=scalar, device=device)
+        """All entries; `_snippet` tells the order."""
+
+    def entry(self, index: int) -> Array:
+        """Return a view of an entry, with the shape of the table."""
+        start = index * self.stride
+        return self.array[start : start + self._size].reshape(self._shape)
 
 
 class WarpActuators:
@@ -113,31 +147,31 @@ class WarpActuators:
             for column, (name, path) in enumerate(paths.items())
             if path in varying or (rows[:, column] != rows[0, column]).any()
         )
-        self._kernel = _kernel(actuators[0], self._variables, real, edge)
-        used = [parameters_type(self.family)._fields.index(name) for name in self._variables]
-        self._parameters = self._table(
-            rows.T[used][:, np.newaxis].repeat(self._num_rows, axis=1).reshape(-1)
-        )
-        num_states, num_signals = len(self.family.State._fields), len(self.family.Signals._fields)
-        size = num_worlds * len(actuators)
+        self._kernel = _kernel(actuators[0], self._variables, timestep, real, edge)
+        self._parameters = self._table(len(self._variables), self._num_rows)
+        for index, name in enumerate(self._variables):
+            values = rows[:, parameters_type(self.family)._fields.index(name)]
+            self._parameters.entry(index).assign(np.tile(values, (self._num_rows, 1)))
         # The first half are the committed states, the second the candidates of the present step.
-        self._states = self._table(np.zeros(2 * num_states * size))
-        self._signals = self._table(np.zeros(num_signals * size))
-        self._record = self._table(np.full((_RECORD_SIZE, num_worlds, len(actuators)), _NEVER))
-        self._keys = self._table(np.zeros((num_worlds, len(actuators))))
-        self._arms = self._table([actuator.arm_radius for actuator in actuators])
-        limits = np.array(force_limits or [(-math.inf, math.inf)] * len(actuators), dtype=float)
-        self._limits = self._table(limits)
+        self._states = self._table(2 * len(self.family.State._fields), num_worlds)
+        self._signals = self._table(len(self.family.Signals._fields), num_worlds)
+        self._record = self._table(_RECORD_SIZE, num_worlds)
+        self._record.array.fill_(_NEVER)
+        self._keys = self._array(np.zeros((num_worlds, len(actuators))))
+        self._arms = self._array([actuator.arm_radius for actuator in actuators])
+        self._limits = self._array(force_limits or [(-math.inf, math.inf)] * len(actuators))
         self._ids = wp.array(self.columns, dtype=int, device=self.device)
         self._unknown_inertia = wp.full((1, 1), math.inf, dtype=self._edge, device=self.device)
         self._stages = 4 if holds_stages else 1
 
-    def _table(self, values: object) -> Array:
-        """Return an array on the device; Warp has no empty arrays of data that kernels may read."""
-        array = np.asarray(values, dtype=np.float64)
-        return wp.array(
-            array if array.size else np.zeros(1), dtype=self._scalar, device=self.device
-        )
+    def _table(self, num_entries: int, num_rows: int) -> LaneTable:
+        """Return a table for all actuators in some worlds."""
+        shape = num_rows, len(self.actuators)
+        return LaneTable(num_entries, shape, self._scalar, self.device)
+
+    def _array(self, values: object) -> Array:
+        """Return an array on the device."""
+        return wp.array(np.asarray(values, np.float64), dtype=self._scalar, device=self.device)
 
     def step(self, arrays: StepArrays) -> None:
         """Write the forces that the actuators deliver over a step.
@@ -154,10 +188,12 @@ class WarpActuators:
                 self._num_rows,
                 self._stages,
                 self._ids,
-                self._parameters,
-                self._states,
-                self._signals,
-                self._record,
+                self._parameters.stride,
+                self._states.stride,
+                self._parameters.array,
+                self._states.array,
+                self._signals.array,
+                self._record.array,
                 self._keys,
                 self._arms,
                 self._limits,
@@ -188,8 +224,8 @@ class WarpActuators:
         wp.launch(
             _forget,
             dim=(self.num_worlds, len(self.actuators)),
-            inputs=[mask],
-            outputs=[self._record],
+            inputs=[mask, len(self.actuators)],
+            outputs=[self._record.array],
             device=self.device,
         )
 
@@ -207,8 +243,7 @@ class WarpActuators:
         check_names([path], paths.values(), "parameter")
         if path not in names:
             raise ValueError(f"{path}: is a constant of the kernel: name it in `varying`")
-        shape = self._num_rows, len(self.actuators)
-        return _slice(self._parameters, self._variables.index(names[path]), shape)
+        return self._parameters.entry(self._variables.index(names[path]))
 
     def signal(self, name: str) -> Array:
         """Return a view of a signal in the last step, shape (worlds, actuators).
@@ -216,7 +251,8 @@ class WarpActuators:
         Raises:
             ValueError: the family has no such signal.
         """
-        return self._view(self._signals, self.family.Signals._fields, name, "signal")
+        check_names([name], self.family.Signals._fields, "signal")
+        return self._signals.entry(self.family.Signals._fields.index(name))
 
     def state(self, name: str) -> Array:
         """Return a view of an entry of the state before the last step, shape (worlds, actuators).
@@ -224,12 +260,8 @@ class WarpActuators:
         Raises:
             ValueError: the family has no such entry.
         """
-        return self._view(self._states, self.family.State._fields, name, "entry of the state")
-
-    def _view(self, table: Array, names: Sequence[str], name: str, kind: str) -> Array:
-        """Return a view of one of a table's entries, shape (worlds, actuators)."""
-        check_names([name], names, kind)
-        return _slice(table, names.index(name), (self.num_worlds, len(self.actuators)))
+        check_names([name], self.family.State._fields, "entry of the state")
+        return self._states.entry(self.family.State._fields.index(name))
 
     def draw_noise_keys(self, generator: np.random.Generator) -> None:
         """Give each actuator in each world another random key for its sensor's noise."""
@@ -254,11 +286,13 @@ class WarpActuators:
 
 
 @wp.kernel(enable_backward=False)
-def _forget(mask: wp.array(dtype=wp.bool), record: wp.array3d(dtype=Any)) -> None:
+def _forget(mask: wp.array(dtype=wp.bool), num_actuators: int, record: wp.array(dtype=Any)) -> None:
     """Make the next call of masked worlds begin at rest."""
     world, k = wp.tid()
+    # The time is the first entry of the record.
+    lane = world * num_actuators + k
     if mask[world]:
-        record[TIME, world, k] = type(record[TIME, world, k])(_NEVER)
+        record[lane] = type(record[lane])(_NEVER)
 
 
 def host_indices(worlds: object) -> Any:
@@ -275,34 +309,39 @@ def host_indices(worlds: object) -> Any:
 _SCALARS: dict[Real, Any] = {"double": wp.float64, "float": wp.float32}
 
 
-def _slice(table: Array, index: int, shape: tuple[int, int]) -> Array:
-    """Return one of the parts of a flat table as a view of a shape."""
-    size = shape[0] * shape[1]
-    return table[index * size : (index + 1) * size].reshape(shape)
-
-
-def _snippet(actuator: ActuatorModel, variables: Sequence[str], real: Real) -> str:
+def _snippet(actuator: ActuatorModel, variables: Sequence[str], timestep: float, real: Real) -> str:
     """Return the C++ of a function that reads a lane of the tables, and writes it."""
     family = type(actuator)
-    program = c_program(actuator, portable=True, real=real, variables=variables)
-    num_states = len(family.State._fields)
+    program = c_program(actuator, real=real, variables=variables, timestep=timestep)
+    states = family.State._fields
 
     def entry(table: str, index: int) -> str:
-        return f"{table}.data[{index} * lanes + lane]"
+        return f"{table}.data[{index} * stride + lane]"
 
     return "\n".join(
         [
+            # GPUs have these functions.
+            "#ifndef __CUDA_ARCH__",
+            *replacement_functions(real, program.statements),
+            "#endif",
+            "#ifndef HUGE_VAL",
+            "#define HUGE_VAL (1e300 * 1e300)",
+            "#endif",
             *(
-                f"const {real} p_{name} = parameters.data[{index} * num_parameters + row];"
+                f"const {real} p_{name} = parameters.data[{index} * parameter_stride + row];"
                 for index, name in enumerate(variables)
             ),
+            # After a step, its candidates become the committed states.
+            f"const int source = lane + (call == {NEXT} ? {len(states)} * stride : 0);",
             *(
-                f"const {real} s_{name} = {entry('states', index)};"
-                for index, name in enumerate(family.State._fields)
+                f"const {real} s_{name} = call == {AT_REST} ? 0"
+                f" : states.data[{index} * stride + source];"
+                for index, name in enumerate(states)
             ),
+            *(f"{entry('states', index)} = s_{name};" for index, name in enumerate(states)),
             *program.statements,
             *(
-                f"{entry('states', num_states + index)} = {value};"
+                f"{entry('states', len(states) + index)} = {value};"
                 for index, value in enumerate(program.state)
             ),
             *(
@@ -314,28 +353,27 @@ def _snippet(actuator: ActuatorModel, variables: Sequence[str], real: Real) -> s
     )
 
 
-def _kernel(actuator: ActuatorModel, variables: Sequence[str], real: Real, edge: Real) -> Kernel:
+def _kernel(
+    actuator: ActuatorModel, variables: Sequence[str], timestep: float, real: Real, edge: Real
+) -> Kernel:
     """Return the kernel of actuators that differ from an actuator in variables only."""
-    family = type(actuator)
-    snippet = _snippet(actuator, variables, real)
-    return _cached_kernel(snippet, len(family.State._fields), family.MOTION, real, edge)
+    snippet = _snippet(actuator, variables, timestep, real)
+    return _cached_kernel(snippet, type(actuator).MOTION, real, edge)
 
 
 @functools.cache
-def _cached_kernel(
-    snippet: str, num_states: int, is_motion: bool, real: Real, edge: Real
-) -> Kernel:
+def _cached_kernel(snippet: str, is_motion: bool, real: Real, edge: Real) -> Kernel:
     """Return a kernel around the C++ of a family, compiled by Warp at its first launch."""
     scalar, external = _SCALARS[real], _SCALARS[edge]
-    states_per_actuator, motion = wp.constant(num_states), wp.constant(int(is_motion))
+    motion = wp.constant(int(is_motion))
 
     @wp.func_native(snippet)
     def advance(
         lane: int,
         row: int,
-        num_parameters: int,
-        lanes: int,
-        timestep: scalar,
+        parameter_stride: int,
+        stride: int,
+        call: int,
         parameters: wp.array(dtype=scalar),
         states: wp.array(dtype=scalar),
         signals: wp.array(dtype=scalar),
@@ -354,10 +392,12 @@ def _cached_kernel(
         num_rows: int,
         num_stages: int,
         ids: wp.array(dtype=int),
+        parameter_stride: int,
+        stride: int,
         parameters: wp.array(dtype=scalar),
         states: wp.array(dtype=scalar),
         signals: wp.array(dtype=scalar),
-        record: wp.array3d(dtype=scalar),
+        record: wp.array(dtype=scalar),
         keys: wp.array2d(dtype=scalar),
         arms: wp.array(dtype=scalar),
         limits: wp.array2d(dtype=scalar),
@@ -370,55 +410,61 @@ def _cached_kernel(
     ) -> None:
         world, k = wp.tid()
         column = ids[k]
-        lanes = record.shape[1] * num_actuators
         lane = world * num_actuators + k
-        row = (world % num_rows) * num_actuators + k
+        row = wp.where(num_rows > 1, lane, k)
         arm = arms[k]
         time = scalar(times[world])
         position = scalar(positions[world, column]) / arm
         speed = scalar(speeds[world, column]) / arm
         half = timestep * scalar(0.5)
-        elapsed = time - record[TIME, world, k]
+        elapsed = time - record[TIME * stride + lane]
+        steps = record[STEPS * stride + lane]
+        call = int(AT_REST)
         if wp.abs(elapsed) < half:
-            is_moved = position != record[POSITION, world, k] or speed != record[SPEED, world, k]
+            is_moved = (
+                position != record[POSITION * stride + lane]
+                or speed != record[SPEED * stride + lane]
+            )
             if num_stages > 1 and is_moved:
-                forces[world, column] = external(record[TORQUE, world, k] / arm)
+                forces[world, column] = external(record[TORQUE * stride + lane] / arm)
                 return
+            call = REPEATED
         elif elapsed > scalar(0.0) and elapsed < timestep + half:
             # The previous step was taken, so that its candidate becomes the state.
-            for index in range(states_per_actuator):
-                states[index * lanes + lane] = states[(states_per_actuator + index) * lanes + lane]
-            record[STEPS, world, k] = record[STEPS, world, k] + scalar(1.0)
+            call = NEXT
+            steps += scalar(1.0)
         else:
-            for index in range(states_per_actuator):
-                states[index * lanes + lane] = scalar(0.0)
             # Times are counted in steps, because a sum of 32-bit times would drift.
-            record[STEPS, world, k] = wp.round(time / timestep)
-        record[TIME, world, k] = time
-        load = scalar(inertias[world % inertias.shape[0], column % inertias.shape[1]]) * arm * arm
+            steps = wp.round(time / timestep)
+        record[TIME * stride + lane] = time
+        record[STEPS * stride + lane] = steps
+        # Arrays of inertias may have one row for all worlds, or one column for all actuators.
+        inertia = inertias[
+            wp.where(inertias.shape[0] > 1, world, 0), wp.where(inertias.shape[1] > 1, column, 0)
+        ]
         command = scalar(desired[world, column]) * arm
         if motion == 1:
             command = scalar(desired[world, column]) / arm
         torque = advance(
             lane,
             row,
-            num_rows * num_actuators,
-            lanes,
-            timestep,
+            parameter_stride,
+            stride,
+            call,
             parameters,
             states,
             signals,
             command,
             position,
             speed,
-            record[STEPS, world, k] * timestep,
+            steps * timestep,
             keys[world, k],
-            load,
+            scalar(inertia) * arm * arm,
         )
         force = wp.clamp(torque / arm, limits[k, 0], limits[k, 1])
-        record[POSITION, world, k] = position
-        record[SPEED, world, k] = speed
-        record[TORQUE, world, k] = force * arm
+        record[POSITION * stride + lane] = position
+        record[SPEED * stride + lane] = speed
+        record[TORQUE * stride + lane] = force * arm
         forces[world, column] = external(force)
 
     return step

@@ -18,6 +18,7 @@ wp = pytest.importorskip("warp", reason="NOT RUN: Warp is not installed: make si
 # The modules import Warp.
 from codrl_mj.arrays import warp as our_warp  # noqa: E402
 from codrl_mj.arrays import warp_inertia  # noqa: E402
+from codrl_mj.arrays.c_code import replacement_functions  # noqa: E402
 from codrl_mj.arrays.warp import StepArrays, WarpActuators  # noqa: E402
 
 wp.config.quiet = True
@@ -42,22 +43,21 @@ def run(actuators, real):
         return wp.array(values.reshape(num, 1), dtype=kernel._scalar, device="cpu")
 
     desired, position, speed, time, keys, inertia = actuators.inputs.T.copy()
-    if actuators.parameters.size:
-        kernel._parameters.assign(actuators.parameters.T.ravel())
+    for index, values in enumerate(actuators.parameters.T):
+        kernel._parameters.entry(index).assign(values.reshape(num, 1))
     num_states = len(family.State._fields)
-    if num_states:
-        kernel._states.assign(np.tile(actuators.state.T.ravel(), 2))
+    for index, values in enumerate(actuators.state.T):
+        kernel._states.entry(index).assign(values.reshape(num, 1))
     kernel._keys.assign(keys.reshape(num, 1))
-    record = np.zeros((our_warp._RECORD_SIZE, num, 1))
-    record[our_warp.TIME, :, 0] = time
-    record[our_warp.STEPS, :, 0] = np.round(time / actuators.timestep)
-    kernel._record.assign(record)
+    kernel._record.entry(our_warp.TIME).assign(time.reshape(num, 1))
+    steps = np.round(time / actuators.timestep)
+    kernel._record.entry(our_warp.STEPS).assign(steps.reshape(num, 1))
     force = column(np.zeros(num))
     times = wp.array(time, dtype=kernel._scalar, device="cpu")
     kernel.step(
         StepArrays(times, column(desired), column(position), column(speed), force, column(inertia))
     )
-    states = kernel._states.numpy()[num_states * num :][: num_states * num].reshape(-1, num)
+    states = [kernel._states.entry(num_states + k).numpy()[:, 0] for k in range(num_states)]
     signals = [kernel.signal(name).numpy()[:, 0] for name in family.Signals._fields]
     return np.column_stack([*states, force.numpy()[:, 0], *signals]).astype(float)
 
@@ -131,12 +131,40 @@ def test_wrong_arguments_are_refused():
         WarpActuators([Drive()], 1, 0.002, device="cpu").signal("heat")
 
 
+LACKING = {"expm1": np.expm1, "log1p": np.log1p, "hypot": np.hypot, "copysign": np.copysign}
+
+
+@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("name", LACKING)
+def test_functions_that_warp_lacks_on_a_cpu(name, real):
+    scalar, dtype = (wp.float64, np.float64) if real == "double" else (wp.float32, np.float32)
+    arguments = "x, y" if name in ("hypot", "copysign") else "x"
+    call = f"return {name}{'f' if real == 'float' else ''}({arguments});"
+    functions = replacement_functions(real, [call])
+    assert replacement_functions(real, ["return 1.0;"]) == []
+
+    @wp.func_native("\n".join([*functions, call]))
+    def native(x: scalar, y: scalar) -> scalar: ...
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def run(a: wp.array(dtype=scalar), b: wp.array(dtype=scalar), out: wp.array(dtype=scalar)):
+        out[wp.tid()] = native(a[wp.tid()], b[wp.tid()])
+
+    x = np.concatenate([np.geomspace(1e-12, 20.0, 200), [0.0, 0.5]]).astype(dtype)
+    x = np.concatenate([x, -np.minimum(x, 0.9)])
+    y = np.resize(np.array([1.0, -0.3, 0.0, -0.0], dtype), x.size)
+    a, b, out = (wp.array(values, dtype=scalar, device="cpu") for values in (x, y, 0.0 * x))
+    wp.launch(run, x.size, inputs=[a, b], outputs=[out], device="cpu")
+    expected = LACKING[name](x, y) if "," in arguments else LACKING[name](x)
+    np.testing.assert_allclose(out.numpy(), expected, rtol=8 * np.finfo(dtype).eps)
+
+
 @pytest.mark.parametrize("architecture", [80, 90])
 @pytest.mark.parametrize("real", ["double", "float"])
 @pytest.mark.parametrize("name", ["drive", "servo", "current_loop", "gearbox"])
 def test_kernels_compile_for_cuda_without_a_device(name, real, architecture, tmp_path):
     family = FAMILIES[name][0]
-    kernel = our_warp._kernel(family(), parameter_paths(family), real, "float")
+    kernel = our_warp._kernel(family(), parameter_paths(family), 0.002, real, "float")
     compile_for_cuda(kernel, architecture, tmp_path)
 
 
