@@ -130,7 +130,7 @@ def assess_fits(
 
 
 def _limit_status(estimates: list[Estimate], misfits: Mapping[str, Misfit]) -> list[Estimate]:
-    """Return estimates of which none is `identified` if the model does not explain a log.
+    """Return estimates, none of them `identified` if the model does not explain a log.
 
     Parameters of a model that misses a log by far absorb the rest of the motion. They look precise,
     because they do so in all parts of the log.

@@ -194,10 +194,10 @@ def apply_options(spec: mujoco.MjSpec, options: Options) -> None:
         across = options.rod_inertia - options.rod_mass * center**2
     # In any body, the inertia about one axis is at most the sum of those about the other two.
     if across < along / 2.0:
-        least = options.rod_mass * center**2 + along / 2.0
+        min_inertia = options.rod_mass * center**2 + along / 2.0
         raise ValueError(
             f"rod_inertia = {options.rod_inertia:g}: with rod_mass = {options.rod_mass:g} and its"
-            f" center of mass at {center:g} m it must be at least {least:.4g} kg*m^2; correct"
+            f" center of mass at {center:g} m it must be at least {min_inertia:.4g} kg*m^2; correct"
             " rod_inertia, rod_center or rod_length"
         )
     rod.mass = options.rod_mass

@@ -13,11 +13,11 @@ ARM = """<mujoco><option timestep="5e-4" integrator="implicitfast"/><worldbody>
 <inertial mass="0.6" pos="0 0 -0.25" diaginertia="0.006 0.006 0.001"/></body></body></worldbody></mujoco>"""
 
 
-def elbow_log(own, shared, frequencies, duration=6.0):
+def elbow_log(separate, shared, frequencies, duration=6.0):
     """Return a log of an elbow under a torque, while a servo moves the shoulder.
 
     Args:
-        own: amplitude of the part of the torque [N*m] that has its own phases.
+        separate: amplitude of the part of the torque [N*m] that has phases of its own.
         shared: amplitude of the part [N*m] that has the phases of the shoulder's motion.
         frequencies: of both motions [Hz].
         duration: of the log [s].
@@ -28,7 +28,7 @@ def elbow_log(own, shared, frequencies, duration=6.0):
     phases = np.random.default_rng(0).uniform(0.0, 6.28, (2, len(frequencies)))
     angles = 2.0 * np.pi * np.outer(time, frequencies)
     shoulder, elbow = (np.sin(angles + phase).sum(axis=1) for phase in phases)
-    torque = shared * shoulder + own * elbow
+    torque = shared * shoulder + separate * elbow
     position = np.empty(len(time))
     for row in range(len(time)):
         position[row] = data.qpos[1]
@@ -70,10 +70,10 @@ def test_a_torque_that_resists_slowly_and_accelerates_fast_has_its_sign():
 
 
 @pytest.mark.matrix
-@pytest.mark.parametrize(("own", "shared"), [(0.1, -0.1), (0.1, 0.0)])
-def test_nothing_is_identified_from_a_joint_that_another_moves(own, shared):
+@pytest.mark.parametrize(("separate", "shared"), [(0.1, -0.1), (0.1, 0.0)])
+def test_nothing_is_identified_from_a_joint_that_another_moves(separate, shared):
     """The elbow's inertia is 0.0435 kg*m^2 and its weight 1.47 N*m if the shoulder is held."""
-    result = identify([elbow_log(own, shared, (0.4, 0.9, 1.6))], "pendulum")
+    result = identify([elbow_log(separate, shared, (0.4, 0.9, 1.6))], "pendulum")
     assert "identified" not in {estimate.status for estimate in result.estimates}
     for name, truth in (("inertia", 0.0435), ("mgl", 1.4715)):
         estimate = result[name]

@@ -59,7 +59,7 @@ def test_the_inertias_of_uniform_parts_are_those_of_the_default_rig():
     rod = NUMBERS["rod_mass"] * NUMBERS["rod_length"] ** 2 / 3
     options = {"arm_inertia": arm, "rod_inertia": rod, "rod_center": NUMBERS["rod_length"] / 2}
     default, explicit = (
-        codrl_mj.make("furuta", actuator="ideal", **given) for given in ({}, options)
+        codrl_mj.make("furuta", actuator="ideal", **chosen) for chosen in ({}, options)
     )
     np.testing.assert_allclose(play(explicit), play(default), atol=1e-6)
     # Twice the inertia about the shaft halves an acceleration that the rod does not influence.
