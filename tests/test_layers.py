@@ -191,7 +191,15 @@ ALLOWED = {
         *("sizing", "engine", "runs", "runs.files", "runs.policies", "tasks", "training"),
     },
     "rl_zoo3": set(),
-    "identify": {"actuators", "catalogue", "fields", "compile_cache", "runs.files", "user_code"},
+    "identify": {
+        "actuators",
+        "catalogue",
+        "fields",
+        "compile_cache",
+        "disturbances",
+        "runs.files",
+        "user_code",
+    },
     "viz.pages": {
         *(
             "__init__",

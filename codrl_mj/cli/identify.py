@@ -39,6 +39,9 @@ Columns = Annotated[
 _FILE = tyro.conf.arg(metavar="LOG", help="Log files: CSV, JSON (both also as .gz) or Parquet.")
 Logs = Annotated[tyro.conf.Positional[tuple[Path, ...]], _FILE]
 """Type of a verb's field for log files."""
+# A guessed rig would be pasted, and an assumed inertia of 0 falsifies the rotor's.
+OPEN_RIG = "RIG"
+"""Placeholder in a proposed command for the rig that the user has to fill in."""
 _STYLES = {"error": "red", "warning": "yellow", "info": ""}
 
 
@@ -51,8 +54,9 @@ class Identify:
     actuator.yaml, which --actuator accepts, result.json and report.html. A training with this
     actuator and --env.randomize identified draws the parameters from their intervals. If an
     actuator needs a parameter that the logs do not determine, there is no actuator.yaml and the
-    exit status is 1, until you give its value with --known. See also codrl-mj identify check, plan
-    and simulate, which prepare a fit, and docs/identify.md.
+    exit status is 1, until you give its value with --known. Logs of a torque give a joint.yaml
+    instead: friction, damping and armature for --actuator ideal. See also codrl-mj identify check,
+    plan and simulate, which prepare a fit, and docs/identify.md.
 
     Example: codrl-mj identify swing1.csv swing2.csv --columns
     time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad --rig pendulum --known mgl=2.81
@@ -95,8 +99,9 @@ class Identify:
     def run(self) -> Output:
         """Check the logs, fit the parameters, print a table, and write the files."""
         from codrl_mj.identify.identify import check_arguments, identify, predict_missing
+        from codrl_mj.identify.log import assign_log_roles
         from codrl_mj.identify.reading import read_log
-        from codrl_mj.identify.result import ACTUATOR
+        from codrl_mj.identify.result import ACTUATOR, JOINT
         from codrl_mj.sizing import find_drive
 
         logs, held_out = (
@@ -110,7 +115,8 @@ class Identify:
         fit_arguments = logs, self.rig, known, self.friction
         all_known = check_arguments(*fit_arguments, self.estimate, self.segment, mapping)
         if problem_text := predict_missing(logs, all_known, mapping):
-            print_text(f"there will be no actuator. {problem_text}", style="yellow")
+            file = f", only a {JOINT}" if assign_log_roles(logs).driven_by == "torque" else ""
+            print_text(f"there will be no actuator{file}. {problem_text}", style="yellow")
         held_out = self._check(logs, held_out, base_drive)
         with progress_bar("{task.completed}/{task.total}") as bar:
             row = bar.add_task("identifying", total=1)
@@ -148,7 +154,8 @@ class Identify:
                     " 'codrl-mj[validate]'"
                 )
         units = {estimate.name: estimate.unit for estimate in result.estimates}
-        return int(problem is not None), result.as_mapping() | {"units": units}
+        has_result = problem is None or result.joint_text is not None
+        return int(not has_result), result.as_mapping() | {"units": units}
 
     def _check(self, logs: list[Log], held_out: list[Log], base_drive: Drive | None) -> list[Log]:
         """Print the problems of the logs, and return the held-out logs that have no errors."""
@@ -230,7 +237,9 @@ def print_identification(result: Identified) -> None:
             )
     print_text(*(f"warning: {text}" for text in result.warnings), style="yellow")
     print_text(result.friction_reason, result.supply_text or "", result.base_text or "")
-    if problem := result.problem():
+    if joint_text := result.joint_text:
+        print_text(joint_text)
+    elif problem := result.problem():
         print_text(f"not to be used as an actuator: {problem}", style="yellow")
 
 
@@ -508,9 +517,9 @@ def _sensors(texts: Sequence[str]) -> dict[str, Sensor]:
 class ProposeColumns:
     """Propose the --columns of a log from its names, units and values, and print the next command.
 
-    If the unit of a column is unknown, it is printed as UNIT; replace it by the unit. The exit
-    status is 1 if no parameter can be identified from these columns. Example: codrl-mj identify
-    columns log.csv
+    If the unit of a column is unknown, it is printed as UNIT; replace it by the unit, and RIG by
+    the load on the output. The exit status is 1 if no parameter can be identified from these
+    columns. Example: codrl-mj identify columns log.csv
     """
 
     log: Annotated[tyro.conf.Positional[Path], _FILE]
@@ -532,12 +541,12 @@ class ProposeColumns:
         if not is_open and self._has_errors(proposal.columns):
             verb = "identify check"
         elif re.search("(position|velocity)=", proposal.columns):
-            rig = " --rig free --known load_inertia=0"
+            rig = f" --rig {OPEN_RIG}"
         unit_hint = ", with its unit for each UNIT" if is_open else ""
         out = "" if "check" in verb else " --out motor"
         rig_hint = (
-            ", for a motor without a load (else --rig pendulum if one hangs at position 0, load if"
-            " it lifts one)"
+            f"; {OPEN_RIG} is pendulum if a load hangs at position 0, load if the motor lifts one,"
+            " and otherwise free (add --known load_inertia=0 if nothing is mounted on the motor)"
         )
         print_text(f"next{unit_hint}{rig_hint if rig else ''}:")
         print(

@@ -300,9 +300,9 @@ class EnvConfig:
     reset's info, `randomization`.
     """
     options: Options = None
-    """Options of the task, a mapping (CartPole: `center_radius`, `sutton_barto_reward`), stored as
-    the task's `NamedTuple`; for a third-party environment the keyword arguments of its constructor,
-    such as frame_skip.
+    """Options of the task, a mapping (CartPole: `center_radius`, `sutton_barto_reward`; Furuta:
+    `rod_length` and others of its rig), stored as the task's `NamedTuple`; for a third-party
+    environment the keyword arguments of its constructor, such as frame_skip.
     """
 
     def __post_init__(self) -> None:

@@ -95,6 +95,7 @@ class ResolvedEnv:
             self.config.disturbances,
             self.config.joint,
             commands.force_per_position,
+            self.config.options,
         )
         return SimulationConfig(
             self.task, commands.simulated, self.inner_steps, integrator, *further_settings
@@ -105,7 +106,7 @@ class ResolvedEnv:
         """Distributions of the fields that are drawn at every reset."""
         simulation, config = self.simulation, self.config
         # The task's model with ideal actuators; `simulate` compiles the one with the motors.
-        model = bare_model(self.task.name, config.joint)
+        model = bare_model(self.task.name, config.joint, config.options)
         motors = {
             model.actuator(name).id: actuator
             for name, actuator in zip(self.task.motors, simulation.actuators, strict=True)

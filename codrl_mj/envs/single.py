@@ -351,7 +351,9 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Action]):
             return self.physics, self.physics.scene
         if self._fallback_scene is None:
             self._fallback_scene = MujocoPhysics(
-                SimulationConfig(self.task, [IDEAL] * len(self.task.motors))
+                SimulationConfig(
+                    self.task, [IDEAL] * len(self.task.motors), options=self.setup.config.options
+                )
             )
         return self._fallback_scene, self._fallback_scene.scene
 

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import typing
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -27,10 +28,44 @@ from codrl_mj.envs.patterns import pattern_mapping
 from codrl_mj.envs.registration import register
 from codrl_mj.fields import check_pattern, did_you_mean
 from codrl_mj.tasks import TASKS, Task, find_task, reference_of, resolve_actuators
+from codrl_mj.tasks.base import OptionBounds
+from codrl_mj.tasks.base import Options as TaskOptions
 from codrl_mj.user_code import asset_path
 
 _NOT_OPTIONS = ("render_mode", "width", "height", "camera", "pretty", "disable_env_checker")
 """Arguments of `gymnasium.make` and of an environment's rendering, which are no options."""
+
+
+def _check_option(option_type: type[TaskOptions], name: str, value: Argument) -> None:
+    """Raise if a value is out of an option's bounds; see `Task.options`."""
+    default = option_type._field_defaults[name]
+    hints = typing.get_type_hints(option_type, include_extras=True)
+    bounds: OptionBounds | None = next(
+        (
+            entry
+            for entry in getattr(hints[name], "__metadata__", ())
+            if isinstance(entry, OptionBounds)
+        ),
+        None,
+    )
+    if isinstance(default, bool):
+        is_allowed, expected = isinstance(value, bool), "True or False"
+    else:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if bounds is not None:
+            sign = ">" if bounds.is_excluded else ">="
+            expected = f"a finite number {sign} {bounds.minimum:g} [{bounds.unit}]"
+            is_allowed = (
+                is_number
+                and math.isfinite(value)
+                and (value > bounds.minimum if bounds.is_excluded else value >= bounds.minimum)
+            )
+        elif default > 0:
+            is_allowed, expected = is_number and value > 0, "a number > 0"
+        else:
+            is_allowed, expected = is_number and math.isfinite(value), "a finite number"
+    if not is_allowed:
+        raise ValueError(f"{name} = {value!r}: must be {expected}")
 
 
 class UnknownOptionError(ValueError, TypeError):
@@ -118,20 +153,7 @@ class TaskEnvSource(EnvSource):
                     f" keyword argument {name!r})"
                 )
             options[name] = value = value.item() if isinstance(value, np.generic) else value
-            default = option_type._field_defaults[name]
-            is_flag, positive = isinstance(default, bool), default > 0
-            is_allowed = isinstance(value, int | float) and (
-                is_flag or (value > 0 if positive else math.isfinite(value))
-            )
-            if isinstance(value, bool) != is_flag or not is_allowed:
-                expected = (
-                    "True or False"
-                    if is_flag
-                    else "a number > 0"
-                    if positive
-                    else "a finite number"
-                )
-                raise ValueError(f"{name} = {value!r}: must be {expected}")
+            _check_option(option_type, name, value)
         return option_type(
             **{
                 name: value if isinstance(value, bool) else float(value)

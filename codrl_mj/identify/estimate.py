@@ -39,6 +39,15 @@ MAX_MEAN_RESIDUAL = 8.0
 """Largest mean residual attributed to noise, in standard deviations of the sensor."""
 MAX_UNEXPLAINED_SHARE = 0.02
 """Largest unexplained share of the variation within a segment."""
+
+
+class Misfit(NamedTuple):
+    """Disagreement of a log with a fitted model that does not explain it."""
+
+    share: float  # unexplained share of the output's variation
+    mean_residual: float  # mean residual in standard deviations of the sensor
+
+
 Simulate = Callable[[Segment, np.ndarray], np.ndarray]
 """Function of a segment and its initial state that returns the output, shape (m,)."""
 
@@ -431,12 +440,12 @@ def _is_better(costs: np.ndarray, reference: np.ndarray) -> bool:
     )
 
 
-def fit_warnings(fit: Fit[Model], shares: dict[str, float]) -> list[str]:
+def fit_warnings(fit: Fit[Model], misfits: dict[str, Misfit]) -> list[str]:
     """Return warnings about the logs or the model of a fit.
 
     Args:
         fit: fit of a model to logs.
-        shares: filled with the unexplained share of each log that the model explains poorly.
+        misfits: filled with the misfit of each log that the model explains poorly.
     """
     unexplained: dict[str, str] = {}
     for index, log in enumerate(fit.logs):
@@ -450,10 +459,11 @@ def fit_warnings(fit: Fit[Model], shares: dict[str, float]) -> list[str]:
         )
         share = float(np.std(errors) / max(np.std(variations), 1e-12))
         # The mean absolute value of normal noise is 0.8 standard deviations.
-        if sizes.mean() / 0.8 > MAX_MEAN_RESIDUAL and share > MAX_UNEXPLAINED_SHARE:
-            shares[log.name] = max(share, shares.get(log.name, 0.0))
+        mean_residual = float(sizes.mean()) / 0.8
+        if mean_residual > MAX_MEAN_RESIDUAL and share > MAX_UNEXPLAINED_SHARE:
+            misfits[log.name] = Misfit(share, mean_residual)
             unexplained[log.name] = (
-                f"{sizes.mean() / 0.8:.1f} standard deviations of the sensor, {100.0 * share:.2g} %"
+                f"{mean_residual:.1f} standard deviations of the sensor, {100.0 * share:.2g} %"
                 " of the output's variation"
             )
     warnings = []

@@ -42,7 +42,7 @@ from codrl_mj.identify.result import (
 )
 from codrl_mj.identify.uncertainty import assess_fits, correlations
 
-STEPS_PER_PART = 8 + 4
+STEPS_PER_PART = 8 + 5
 """Progress steps for each part: for its fit, and for the assessment of its uncertainty."""
 
 

@@ -324,7 +324,13 @@ def _guess_shaft(
         gain = fixed.get("torque_constant", _torque_per_input(coefficients, known) / ratio) * ratio
     start = dict(fixed)
     if driven_by == "voltage":
-        if "torque_constant" in known or "resistance" in known:
+        scale_names = ("mgl", "constant_torque", "inertia")
+        if "resistance" in known and not {"torque_constant", *scale_names} & known.keys():
+            # Without a known torque, the viscous term, which is (kT*kE/R + viscous friction) over
+            # kT/R at the output, is attributed to back-EMF alone. A guess that is far too large
+            # would make the friction so large that the simulated shaft never moves.
+            torque_per_volt = (max(coefficients["viscous"], 0.0) + 1e-6) / resistance
+        elif "torque_constant" in known or "resistance" in known:
             torque_per_volt = _torque_per_input(
                 coefficients, known, gain / resistance if "torque_constant" in known else gain
             )

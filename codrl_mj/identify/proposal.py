@@ -4,7 +4,7 @@ import json
 import keyword
 import math
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from codrl_mj.identify.columns import COLUMN_UNITS, EXAMPLES, OPEN_UNIT, Column, parse_columns
 from codrl_mj.identify.log import (
+    INPUTS,
     counts_per_turn,
     find_obstacle,
     find_resolution,
@@ -49,6 +50,17 @@ _NO_SIGNALS = {"error", "err", "limit", "max", "mode", "status", "fault", "gain"
 """Words in the name of a column that no fit uses."""
 _INPUTS = {"input", "in", "dc"}
 """Words in the name of a signal at the input of a servo or an inverter, not at the motor."""
+_MEASURED = {"meas", "measured", "present", "actual", "feedback"}
+"""Words in the name of a column that is preferred to other columns of its signal."""
+_NOT_MEASURED = {
+    *("con", "ctrl", "control", "controller", "cmd", "command", "des", "desired", "target", "goal"),
+    *("ref", "reference", "ff", "feedforward", "fric", "friction", "filt", "filtered"),
+}
+"""Words in the name of a column that is taken only if its signal has no other column: commands,
+parts of them, and filtered signals, which are late.
+"""
+_PLANT_INPUTS = "input", "control", "output"
+"""Words in the names of columns that may be a motor's voltage, the most likely one first."""
 _SPELLINGS = {
     "deg": "° º degrees",
     "deg/s": "dps",
@@ -123,20 +135,17 @@ def propose_columns(path: Path | str) -> Proposal:
     if not path.is_file():
         raise FileNotFoundError(f"no log at {path}")
     table, entries, doubts = read_table(path), dict[str, _Entry](), list[str]()
-    for name in table.columns:
-        # Only the first entry of a list is proposed. Nanoseconds are added to their column of
-        # seconds.
-        list_entry = re.fullmatch(r"(.*)\[(\d+)\]", name)
-        if (list_entry and list_entry[2] != "0") or re.sub("nanosec$", "sec", name) in {
-            *table.columns
-        } - {name}:
-            continue
-        header = _parse_header(name, table)
-        signal, unit, doubt = _signal(header, entries)
+    headers = {name: _parse_header(name, table) for name in table.columns if _is_own(name, table)}
+    best_columns = _best_columns(headers, table)
+    for name, header in headers.items():
+        signal, unit, doubt = _signal(header)
         if signal and not _finite_values(name, table).size:
             signal, doubt = None, "holds no numbers, left out"
+        elif signal and best_columns[signal] != name:
+            signal, doubt = None, f"left out, another column is the {signal}"
         if signal:
             entries[signal], doubt = _entry(signal, header, unit, table)
+        list_entry = re.fullmatch(r"(.*)\[0\]", name)
         if signal and list_entry:
             entry_names = table.entries.get(
                 list_entry[1],
@@ -147,6 +156,10 @@ def propose_columns(path: Path | str) -> Proposal:
             )
         doubts += [f"{name}: {doubt}"] if doubt else []
     doubts += _add_voltage(entries, table)
+    if plant_input := _add_plant_input(entries, headers, table):
+        left_out = f"{entries['voltage'].column}: not known, left out"
+        doubts = [*(doubt for doubt in doubts if doubt != left_out), plant_input]
+    doubts += _other_joints(entries, table)
     if "time" not in entries or len(entries) < 2:
         known = ", ".join(table.columns)
         raise ValueError(
@@ -159,20 +172,88 @@ def propose_columns(path: Path | str) -> Proposal:
     return Proposal(columns, tuple(doubts), _problem(path.stem, table, entries))
 
 
-def _signal(header: _Header, used: Collection[str]) -> tuple[str | None, str | None, str]:
+def _is_own(name: str, table: Table) -> bool:
+    """Return True if a column is considered by itself.
+
+    Only the first entry of a list is proposed. Nanoseconds are added to their column of seconds.
+    """
+    list_entry = re.fullmatch(r".*\[(\d+)\]", name)
+    is_rest = re.sub("nanosec$", "sec", name) in {*table.columns} - {name}
+    return not (list_entry and list_entry[1] != "0") and not is_rest
+
+
+def _words(header: _Header) -> list[str]:
+    """Return the words in a column's name, in lower case."""
+    # iMotor is split into words like i_motor, but a unit such as mA must not be split.
+    separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", header.bare_name).lower()
+    return [word for word in re.split(r"[\W\d_]+", separated) if word]
+
+
+def _best_columns(headers: Mapping[str, _Header], table: Table) -> dict[str, str]:
+    """Return the best column of each signal: a measured one, and otherwise the first."""
+    ranks: dict[str, list[tuple[int, str]]] = {}
+    for name, header in headers.items():
+        signal = _signal(header)[0]
+        if signal is None or not _finite_values(name, table).size:
+            continue
+        words = {*_words(header)}
+        rank = 2 if words & _NOT_MEASURED else 1
+        rank = 0 if words & _MEASURED else rank
+        ranks.setdefault(signal, []).append((rank if signal != "command" else 0, name))
+    return {
+        signal: min(columns, key=lambda column: column[0])[1] for signal, columns in ranks.items()
+    }
+
+
+def _add_plant_input(
+    entries: dict[str, _Entry], headers: Mapping[str, _Header], table: Table
+) -> str:
+    """Map an input of the plant to the voltage if no other column drives the motor.
+
+    Returns:
+        A doubt on the mapped column; empty if there is none.
+    """
+    if entries.keys() & {"voltage", "duty", *INPUTS}:
+        return ""
+    used = {entry.column for entry in entries.values()}
+    for word in _PLANT_INPUTS:
+        for name, header in headers.items():
+            words = {*_words(header)}
+            values = _finite_values(name, table)
+            is_input = word in words and not words & _NO_SIGNALS and name not in used
+            if is_input and values.size and np.ptp(values) > 0.0:
+                entry, _ = _entry("voltage", header, OPEN_UNIT, table)
+                entries["voltage"] = entry
+                return (
+                    f"{name}: by its name the motor's input: replace UNIT by V if it is the voltage"
+                    " at the terminals, or write torque= or current="
+                )
+    return ""
+
+
+def _other_joints(entries: Mapping[str, _Entry], table: Table) -> list[str]:
+    """Return a doubt if the file has the same columns for several joints."""
+    for signal in ("position", "velocity"):
+        numbered = signal in entries and re.fullmatch(r"(.*?)(\d+)", entries[signal].column)
+        if not numbered:
+            continue
+        pattern = re.escape(numbered[1]) + r"\d+"
+        columns = [name for name in table.columns if re.fullmatch(pattern, name)]
+        if len(columns) > 1:
+            return [
+                f"{', '.join(columns)}: several joints, of which {numbered[0]} is taken: a fit of"
+                " one joint is right only if the others were held"
+            ]
+    return []
+
+
+def _signal(header: _Header) -> tuple[str | None, str | None, str]:
     """Return a column's signal, its stated unit, and the reason why it is left out.
 
     Signal and unit are None if they are unknown.
     """
     name, stated = header.name, header.stated_units
-    # iMotor is split into words like i_motor, but a unit such as mA must not be split.
-    words = [
-        word
-        for word in re.split(
-            r"[\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", header.bare_name).lower()
-        )
-        if word
-    ]
+    words = _words(header)
     parts = [part for part in re.split(r"[\W_]+", name.lower() if name.isupper() else name) if part]
     # The last two parts may be a unit, as in deg_s or N_m.
     has_pair = len(parts) > 2 and not any(re.search(r"\d", part) for part in parts[-2:])
@@ -202,6 +283,9 @@ def _signal(header: _Header, used: Collection[str]) -> tuple[str | None, str | N
     candidates = candidates or [
         signal for signal, known in _NAMES.items() if {*known.split()} & {*words[:1]}
     ]
+    # The command of a PWM is the duty itself.
+    if {"command", "duty"} <= {*candidates}:
+        candidates.remove("command")
     if not candidates and {*words} & _READINGS:
         candidates = [
             signal for signal in ("velocity", "position", "current", "torque") if units[signal]
@@ -215,12 +299,8 @@ def _signal(header: _Header, used: Collection[str]) -> tuple[str | None, str | N
         signal for signal in candidates if any(_valid_unit(signal, text) for text in stated)
     ]
     best = next(iter([*with_unit, *candidates]), None)
-    if best is None or best in used:
-        return (
-            None,
-            None,
-            f"left out, another column is the {best}" if best else "not known, left out",
-        )
+    if best is None:
+        return None, None, "not known, left out"
     return best, units[best], ""
 
 

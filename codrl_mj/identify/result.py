@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple, cast
 import numpy as np
 
 from codrl_mj.actuators import Drive, GearMotor, Supply, actuator_from_mapping
+from codrl_mj.disturbances import Joint
 from codrl_mj.identify.estimate import Fit, Model, best_initial_state
 from codrl_mj.identify.log import Log, Segment, gapless_stretches, initial_state
 from codrl_mj.identify.models import ShaftModel
@@ -17,6 +18,7 @@ from codrl_mj.runs.files import atomic_write, write_json
 
 Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "refused"]
 ACTUATOR = "actuator.yaml"  # name of the file in a folder of results
+JOINT = "joint.yaml"  # name of the file for logs that determine a joint, but no motor
 # Above this share, the columns or the model must be wrong, and the parameters are meaningless.
 MAX_UNEXPLAINED = 0.2
 """Largest unexplained share of a log's variation at which parameters are usable."""
@@ -344,10 +346,69 @@ class Identified:
             }
         )
 
+    def joint_problem(self) -> str | None:
+        """Return the reason why the logs give no joint, with a remedy; None if they do."""
+        if self.driven_by != "torque":
+            return "only logs of a torque determine a joint without its motor"
+        if self.unexplained > MAX_UNEXPLAINED:
+            return self.problem()
+        by_name = {estimate.name: estimate for estimate in self.estimates}
+        for name in ("coulomb_friction", "viscous_friction"):
+            estimate = by_name.get(name)
+            if estimate is None:
+                return f"{name} is neither fitted nor known"
+            if estimate.status not in USABLE:
+                return f"{name} is {estimate.status}: {estimate.why}"
+        if self.friction != "coulomb":
+            return "a joint has Coulomb and viscous friction only: fit it with --friction coulomb"
+        return None
+
+    def joint(self) -> Joint:
+        """Return damping, friction and armature of the joint that a torque drives.
+
+        The armature is the rotor's inertia at the output if the logs and the known values determine
+        it, and otherwise 0, because the inertia may belong to the model's bodies.
+
+        Raises:
+            ValueError: the logs do not determine a joint; see `joint_problem`.
+        """
+        problem = self.joint_problem()
+        if problem is not None:
+            raise ValueError(problem)
+        by_name = {estimate.name: estimate for estimate in self.estimates}
+        ratio = by_name["gear_ratio"].value if "gear_ratio" in by_name else 1.0
+        rotor = by_name.get("rotor_inertia")
+        return Joint(
+            damping=by_name["viscous_friction"].value * ratio**2,
+            friction=by_name["coulomb_friction"].value * ratio,
+            armature=rotor.value * ratio**2 if rotor and rotor.status in USABLE else 0.0,
+        )
+
+    @property
+    def joint_text(self) -> str | None:
+        """Text on the joint and its use; None if there is none, or if there is an actuator."""
+        if self.problem() is None or self.joint_problem() is not None:
+            return None
+        values = {
+            field.name: f"{getattr(self.joint(), field.name):.6g}"
+            for field in dataclasses.fields(Joint)
+        }
+        flags = " ".join(f"--env.joint.{name} {value}" for name, value in values.items())
+        names = {"friction": "frictionloss"}
+        attributes = " ".join(
+            f'{names.get(name, name)}="{value}"' for name, value in values.items()
+        )
+        return (
+            "torques determine a joint, but no motor: train with --actuator ideal"
+            f" {flags}, or write <joint {attributes}/> into your model. For an actuator name the"
+            " motor with --motor"
+        )
+
     def as_mapping(self) -> dict[str, object]:
         """Return all results as values that JSON can store."""
         values = dataclasses.asdict(self) | {"problem": self.problem()}
         values |= {"supply_text": self.supply_text, "base_text": self.base_text}
+        values["joint"] = None if self.joint_text is None else dataclasses.asdict(self.joint())
         # Arrays are plotted in reports, and would make the file large.
         del values["traces"]
         for prediction in (*values["fitted"], *values["held_out"]):
@@ -355,25 +416,36 @@ class Identified:
         return values
 
     def write(self, folder: Path) -> list[Path]:
-        """Write result.json and, without a problem, actuator.yaml into a folder, each atomically.
+        """Write result.json, and actuator.yaml or joint.yaml into a folder, each atomically.
 
-        The actuator's file has a drive's fields, and their intervals under `identified`. With a
-        problem, the actuator.yaml of an earlier fit is removed, because it would be mistaken for
-        the result of this fit.
+        The actuator's file has a drive's fields, and their intervals under `identified`. If there
+        is no actuator, the file joint.yaml has the fields of `Joint`, provided that torques
+        determine it. Files of an earlier fit that this fit does not write are removed, because they
+        would be mistaken for its results.
 
         Returns:
             The paths of the files written.
         """
-        import yaml
-
-        actuator, result = folder / ACTUATOR, folder / "result.json"
+        result = folder / "result.json"
         write_json(result, self.as_mapping())
-        if self.problem():
-            actuator.unlink(missing_ok=True)
-            return [result]
-        intervals = {name: list(ends) for name, ends in self.intervals().items()}
-        section: dict[str, object] = {"logs": list(self.logs), "intervals": intervals}
-        content = {**self.actuator().as_mapping(), "identified": section}
-        with atomic_write(actuator) as temporary:
-            temporary.write_text(yaml.safe_dump(content, sort_keys=False))
-        return [actuator, result]
+        contents: dict[str, dict[str, object]] = {}
+        if self.problem() is None:
+            intervals = {name: list(ends) for name, ends in self.intervals().items()}
+            section: dict[str, object] = {"logs": list(self.logs), "intervals": intervals}
+            contents[ACTUATOR] = {**self.actuator().as_mapping(), "identified": section}
+        elif self.joint_text is not None:
+            contents[JOINT] = dataclasses.asdict(self.joint())
+        for name in (ACTUATOR, JOINT):
+            if name in contents:
+                _write_yaml(folder / name, contents[name])
+            else:
+                (folder / name).unlink(missing_ok=True)
+        return [*(folder / name for name in contents), result]
+
+
+def _write_yaml(path: Path, content: Mapping[str, object]) -> None:
+    """Write a mapping as YAML, atomically."""
+    import yaml
+
+    with atomic_write(path) as temporary:
+        temporary.write_text(yaml.safe_dump(dict(content), sort_keys=False))

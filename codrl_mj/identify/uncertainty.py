@@ -10,10 +10,12 @@ identified are reported.
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import cast
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit, Model, fit_warnings, optimize
+from codrl_mj.identify.estimate import Fit, Misfit, Model, fit_warnings, optimize
+from codrl_mj.identify.invariances import invariant_directions
 from codrl_mj.identify.log import BLOCK_DURATION, Log, halve_rate, has_motion, replace_signal
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import DEFAULTS, FRICTION, PARAMETERS, WINDING_SOURCES
@@ -55,16 +57,25 @@ MAX_FRICTION = 0.1
 """Largest relative half-width of a friction parameter with the status `identified`."""
 MAX_BIAS = 0.5
 """Self-test error, over the largest usable half-width, above which it is a reason to refuse."""
+# The worst log of a real pendulum has 12. Joints of a double pendulum that the other joint moves,
+# real and simulated, have 54 to 1200.
+MAX_USABLE_RESIDUAL = 30.0
+"""Largest mean residual of a poorly explained log, in standard deviations of the sensor, at which
+parameters are usable.
+"""
 CAUSES = {
     "curvature": "the logs hardly depend on it",
     "resampling": "parts of the logs disagree",
     "logs": "the logs disagree",
     "half_rate": "a fit of every second row gives another value",
+    "segments": "a fit of segments of another duration gives another value",
     "self_test": "a fit to its own simulation gives another value",
     "unexplained": "the model does not explain the current",
     "torque_constant": "the constant of the winding that it depends on is not known better",
 }
 """Cause of an interval's width -> its description."""
+MIN_SEGMENT_ROWS = 20
+"""Minimum number of rows in the shorter segments that a fit is compared with."""
 BOUND_MARGIN = 1e-3
 """Distance from a bound, in the parameter's scale, below which a value counts as at the bound."""
 
@@ -98,8 +109,11 @@ def assess_fits(
                     if constant
                     else part_estimates
                 )
-        estimates += part_estimates
-        warnings += fit_warnings(fit, unexplained_shares)
+        misfits: dict[str, Misfit] = {}
+        warnings += fit_warnings(fit, misfits)
+        estimates += _limit_status(part_estimates, misfits)
+        for log, misfit in misfits.items():
+            unexplained_shares[log] = max(misfit.share, unexplained_shares.get(log, 0.0))
     completed = _complete(estimates, known, defaults)
     unexplained = max(unexplained_shares.values(), default=0.0)
     if unexplained > MAX_UNEXPLAINED:
@@ -113,6 +127,36 @@ def assess_fits(
             for estimate in completed
         ]
     return completed, warnings, unexplained
+
+
+def _limit_status(estimates: list[Estimate], misfits: Mapping[str, Misfit]) -> list[Estimate]:
+    """Return estimates, none of them `identified` if the model does not explain a log.
+
+    Parameters of a model that misses a log by far absorb the rest of the motion. They look precise,
+    because they do so in all parts of the log.
+
+    Args:
+        estimates: estimates of a part.
+        misfits: misfit of each log that the model explains poorly.
+    """
+    if not misfits:
+        return estimates
+    log = max(misfits, key=lambda name: misfits[name].mean_residual)
+    misfit = misfits[log]
+    reason = (
+        f"the model does not explain log {log}: mean residuals are {misfit.mean_residual:.0f}"
+        " standard deviations of the sensor"
+    )
+    status: Status = "refused" if misfit.mean_residual > MAX_USABLE_RESIDUAL else "rough"
+    limited = ("identified", "rough") if status == "refused" else ("identified",)
+    return [
+        (
+            dataclasses.replace(estimate, status=status, why=reason)
+            if estimate.status in limited
+            else estimate
+        )
+        for estimate in estimates
+    ]
 
 
 def _assess_part(fit: Fit[Model], seed: int, on_step: Callable[[], None]) -> list[Estimate]:
@@ -151,10 +195,11 @@ def _assess_part(fit: Fit[Model], seed: int, on_step: Callable[[], None]) -> lis
         if abs(change) > MIN_SHARE
     ]
     # The three statistical causes estimate the same errors, so that only the largest one counts.
-    # The change at half the rate is independent of them, and is added in squares. Biases are added.
+    # The changes at half the rate and with other segments are independent of them, and are added in
+    # squares. Biases are added.
     statistical = np.max([by_cause[cause] for cause in ("curvature", "resampling", "logs")], axis=0)
     total = (
-        np.hypot(statistical, by_cause["half_rate"])
+        np.hypot(np.hypot(statistical, by_cause["half_rate"]), by_cause["segments"])
         + by_cause["self_test"]
         + by_cause["unexplained"]
     )
@@ -183,9 +228,10 @@ def _assess_part(fit: Fit[Model], seed: int, on_step: Callable[[], None]) -> lis
         status: Status = "ratio"
         if ambiguities and len(ambiguities[0]) > 1:
             shares = ", ".join(
-                f"{parameter} by {100.0 * share:+.0f}"
+                f"{parameter} by {100.0 * share:+.2g}"
                 f" %{' of all friction' if parameter in FRICTION else ''}"
                 for parameter, share in ambiguities[0].items()
+                if abs(share) > MIN_SHARE or parameter == name
             )
             reason = (
                 "only a combination is known: the fit is equally good if these change together:"
@@ -485,6 +531,8 @@ def interval_causes(
         matrix @ (half_rate_values - fit.values)
     )
     on_step()
+    causes["segments"] = np.abs(matrix @ _change_by_segments(fit))
+    on_step()
     causes["self_test"] = np.abs(self_test_values - values)
     # Errors of the input, for example of a voltage that changes between rows, bias the parameters.
     # For a PRBS with a clock of 1 to 4 rows, the relative bias is 2 to 4.6 times the unexplained
@@ -562,7 +610,8 @@ def correlations(fit: Fit[Model]) -> dict[str, dict[str, float]]:
 def unidentifiable_directions(fit: Fit[Model], scales: np.ndarray) -> list[dict[str, float]]:
     """Return the directions in which the parameters can change without a worse fit.
 
-    The derivatives give the weakest direction. Its largest parameter is changed by half its scale,
+    A shaft's exact directions come first; see `invariant_directions`. The derivatives give the
+    weakest direction of the other parameters. Its largest parameter is changed by half its scale,
     and all others are fitted again. If that fit is as good, the changes of all parameters form an
     unidentifiable direction. Derivatives alone do not suffice: dry friction makes the cost rough,
     so that a flat direction looks identified.
@@ -574,48 +623,101 @@ def unidentifiable_directions(fit: Fit[Model], scales: np.ndarray) -> list[dict[
     Returns:
         Shares of the parameters in each direction by name, the largest being 1.
     """
-    directions: list[dict[str, float]] = []
-    current, sizes = fit, scales
+    current, sizes, directions = _without_invariances(fit, scales)
     # The largest parameter of each direction stays fixed while the next direction is searched.
-    while len(current.model.names) > 1 or not directions:
-        model, values = current.model, current.values
+    while len(current.model.names) > (1 if directions else 0):
         matrix = _gauss_newton_sums(current, [segment.block for segment in current.segments])[
             1
         ].sum(axis=0)
         # The eigenvector of the smallest eigenvalue is a unit vector in the scales.
         direction = np.linalg.eigh(matrix * np.outer(sizes, sizes))[1][:, 0]
         index = int(np.argmax(np.abs(direction)))
-        step = PROBE_CHANGE * sizes[index] * np.sign(direction[index])
-        bounds = PARAMETERS[model.names[index]]
+        changed = _probe(current, sizes, direction, index)
+        if changed is None:
+            break
+        step = (changed.model.known[current.model.names[index]] - current.values[index]) / sizes[
+            index
+        ]
+        changes = (changed.values - np.delete(current.values, index)) / np.delete(sizes, index)
+        shares = np.insert(changes, index, step) / step
+        directions.append(
+            {
+                name: float(share)
+                for name, share in zip(current.model.names, shares, strict=True)
+                if abs(share) > MIN_SHARE
+            }
+        )
+        if len(current.model.names) == 1:
+            break
+        current, sizes = changed, np.delete(sizes, index)
+    return directions
+
+
+def _without_invariances(
+    fit: Fit[Model], scales: np.ndarray
+) -> tuple[Fit[Model], np.ndarray, list[dict[str, float]]]:
+    """Return a fit in which a parameter of each exact direction is fixed.
+
+    Returns:
+        The fit, the scales of its parameters, and the directions.
+    """
+    if not isinstance(fit.model, ShaftModel):
+        return fit, scales, []
+    names, fixed, directions = fit.model.names, [], []
+    for direction in invariant_directions(cast("Fit[ShaftModel]", fit), scales):
+        # Each direction is the only one that changes this parameter.
+        fixed.append(int(np.flatnonzero(direction == 1.0)[0]))
+        largest = float(np.abs(direction).max())
+        directions.append(
+            {
+                name: float(share) / largest
+                for name, share in zip(names, direction, strict=True)
+                if share != 0.0
+            }
+        )
+    model = dataclasses.replace(
+        fit.model,
+        names=tuple(np.delete(names, fixed).tolist()),
+        known={**fit.model.known, **{names[index]: float(fit.values[index]) for index in fixed}},
+        scales=np.delete(fit.model.scales, fixed),
+    )
+    reduced = dataclasses.replace(
+        fit,
+        model=model,
+        values=np.delete(fit.values, fixed),
+        jacobians=tuple(np.delete(jacobian, fixed, axis=1) for jacobian in fit.jacobians),
+    )
+    return reduced, np.delete(scales, fixed), directions
+
+
+def _probe(
+    fit: Fit[Model], sizes: np.ndarray, direction: np.ndarray, index: int
+) -> Fit[Model] | None:
+    """Return an equally good fit with another value of a parameter; None if there is none.
+
+    The parameter is changed upwards and downwards, because the fit may be as good only on one side
+    if another parameter is at its bound.
+    """
+    model, values = fit.model, fit.values
+    name, bounds = model.names[index], PARAMETERS[model.names[index]]
+    max_cost = fit.cost + _significant_increase(fit)
+    for sign in (1.0, -1.0):
+        step = sign * PROBE_CHANGE * sizes[index] * np.sign(direction[index])
         if not bounds.lower <= values[index] + step <= bounds.upper:
-            step = -step
+            continue
         start = np.clip(
             values + step / sizes[index] / direction[index] * direction * sizes, 0.2 * values, None
         )
         reduced_model = dataclasses.replace(
             model,
             names=tuple(np.delete(model.names, index).tolist()),
-            known={**model.known, model.names[index]: float(values[index] + step)},
+            known={**model.known, name: float(values[index] + step)},
             scales=np.delete(model.scales, index),
         )
-        changed = optimize(
-            reduced_model, current.segments, np.delete(start, index), 20, current.scale
-        )
-        if changed.costs(current.scale).sum() > current.cost + _significant_increase(current):
-            break
-        changes = (changed.values - np.delete(values, index)) / np.delete(sizes, index)
-        shares = np.insert(changes, index, step / sizes[index]) / step * sizes[index]
-        directions.append(
-            {
-                name: float(share)
-                for name, share in zip(model.names, shares, strict=True)
-                if abs(share) > MIN_SHARE
-            }
-        )
-        if len(model.names) == 1:
-            break
-        current, sizes = changed, np.delete(sizes, index)
-    return directions
+        changed = optimize(reduced_model, fit.segments, np.delete(start, index), 20, fit.scale)
+        if changed.costs(fit.scale).sum() <= max_cost:
+            return changed
+    return None
 
 
 def _significant_increase(fit: Fit[Model]) -> float:
@@ -633,6 +735,22 @@ def _significant_increase(fit: Fit[Model]) -> float:
     correlation = max(float(projections @ projections) / max(strengths[-1] * noise, 1e-30), 1.0)
     # 3.84 is the 95 % quantile of the chi-squared distribution with one degree of freedom.
     return float(3.84 * noise * correlation + SLACK * fit.cost)
+
+
+def _change_by_segments(fit: Fit[Model]) -> np.ndarray:
+    """Return the change of the parameters, shape (p,), in a fit of segments of half the duration.
+
+    If something else moves the shaft, such as another joint, then the fit attributes that motion to
+    the parameters, and to others in segments of another duration. For a model that describes the
+    log, the duration hardly matters. Segments of few rows are doubled instead.
+    """
+    if not isinstance(fit.model, ShaftModel):
+        return np.zeros(len(fit.values))
+    rows = min(fit.model.segment / log.step for log in fit.logs)
+    factor = 0.5 if rows >= 2 * MIN_SEGMENT_ROWS else 2.0
+    model = dataclasses.replace(fit.model, segment=factor * fit.model.segment)
+    changed = optimize(model, model.segments(fit.logs), fit.values, 20).values
+    return np.asarray(changed - fit.values)
 
 
 def _refit_values(fit: Fit[Model], logs: Sequence[Log]) -> np.ndarray:

@@ -37,7 +37,7 @@ class AnalyticPhysics(Physics):
             )
         super().__init__(simulation)
         self.timestep = simulation.timestep
-        self.reference_env = task.reference_env()
+        self.reference_env = task.make_reference_env(simulation.options)
         self._actuators: list[tuple[float, Parameters]] = []
         self.set_actuators(simulation.actuators)
         self.reset(np.zeros(len(task.state_names)))

@@ -14,6 +14,7 @@ from codrl_mj.boundary import Info
 from codrl_mj.disturbances import NO_DISTURBANCES, UNMODIFIED_JOINT, Disturbances, Joint
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
+from codrl_mj.tasks.base import Options
 
 Signals = Info
 """Signals of the actuators after one environment step, by name: `desired_force` and `actual_force`
@@ -124,6 +125,8 @@ class SimulationConfig:
     """Desired force [N or N*m] that corresponds to a position of 1 m or rad, shape (n,); 0 where
     commands are not positions.
     """
+    options: Options = None
+    """Options of the task, which may change its model; their defaults by default."""
 
     def __post_init__(self) -> None:
         """Fill in the task's defaults."""
@@ -136,6 +139,8 @@ class SimulationConfig:
             object.__setattr__(self, "max_forces", self.task.max_forces)
         if self.force_per_position is None:
             object.__setattr__(self, "force_per_position", np.zeros(len(self.max_forces)))
+        if self.options is None:
+            object.__setattr__(self, "options", self.task.options())
 
     @functools.cached_property
     def family(self) -> Family:

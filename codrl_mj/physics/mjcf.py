@@ -111,6 +111,8 @@ def task_model(simulation: SimulationConfig) -> mujoco.MjModel:
             f"{task.asset}: its <option> has integrator {kind}, so Task.integrators cannot have"
             f" {', '.join(unsupported)}"
         )
+    if task.apply_options is not None:
+        task.apply_options(spec, simulation.options)
     spec.option.timestep = simulation.timestep
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if simulation.integrator == "euler":

@@ -84,7 +84,9 @@ class MujocoBatchPhysics:
         if (additions != additions[0]).any():
             indices = [int(wiring.actuator) for wiring in self._wiring]
             variation = Variation(
-                bare_model(task.name, simulation.joint), motors=indices, vary_additions=True
+                bare_model(task.name, simulation.joint, simulation.options),
+                motors=indices,
+                vary_additions=True,
             )
             self.set_model(all_rows, variation.fields(np.empty((self.num_envs, 0)), additions))
 

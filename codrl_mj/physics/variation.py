@@ -14,6 +14,7 @@ from codrl_mj.engine.mounting import joint_addresses
 from codrl_mj.physics.base import SimulationConfig
 from codrl_mj.physics.mjcf import hills, task_model
 from codrl_mj.tasks import TASKS
+from codrl_mj.tasks.base import Options
 
 VISUAL_FIELDS = ("geom_pos", "geom_size")
 """Fields that affect only rendering."""
@@ -30,11 +31,18 @@ DYNAMIC_FIELDS = tuple(
 
 
 @functools.cache
-def bare_model(task: str, joint: Joint = UNMODIFIED_JOINT) -> mujoco.MjModel:
-    """Return the cached model of a task without its actuators' additions; do not change it."""
-    return task_model(
-        SimulationConfig(TASKS[task], (IDEAL,) * len(TASKS[task].motors), joint=joint)
-    )
+def bare_model(
+    task: str, joint: Joint = UNMODIFIED_JOINT, options: Options = None
+) -> mujoco.MjModel:
+    """Return the cached model of a task without its actuators' additions; do not change it.
+
+    Args:
+        task: name of the task.
+        joint: quantities added to its actuated joints.
+        options: options of the task; None for their defaults.
+    """
+    actuators = (IDEAL,) * len(TASKS[task].motors)
+    return task_model(SimulationConfig(TASKS[task], actuators, joint=joint, options=options))
 
 
 def without_additions(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> mujoco.MjModel:

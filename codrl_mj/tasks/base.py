@@ -24,6 +24,17 @@ class NoOptions(NamedTuple):
     """Options of a task without options."""
 
 
+class OptionBounds(NamedTuple):
+    """Unit and smallest value of an option, in its type: `Annotated[float, OptionBounds("kg")]`."""
+
+    unit: str
+    """Unit of the option."""
+    minimum: float = 0.0
+    """Smallest value, in the unit."""
+    is_excluded: bool = False
+    """True if the option must exceed `minimum`."""
+
+
 # Each task declares its own options, and only its own functions read them.
 Options = Any
 """Type of a task's options: a `NamedTuple` of floats and flags whose fields have defaults."""
@@ -123,7 +134,20 @@ class Task(fields.Checked):
     the force. Each is a number, or a tuple if there are several motors.
     """
     options: type[Options] = NoOptions
-    """Class of the task's options: a `NamedTuple` whose fields all have defaults."""
+    """Class of the task's options: a `NamedTuple` whose fields all have defaults.
+
+    Numbers whose default is > 0 must be > 0, others finite, unless the type of a field states
+    `OptionBounds`.
+    """
+    apply_options: Callable[[mujoco.MjSpec, Options], None] | None = None
+    """Function (model, options) -> None, which changes the model, before it is compiled, as the
+    options require; None if options do not change the model.
+
+    It must not change the model if the options have their defaults. It raises ValueError if options
+    contradict each other. `reference_env` is then called with the options as its argument.
+    """
+    reference_options: tuple[Options, ...] = ()
+    """Further options with which the certificate compares the model to the reference."""
     qpos: tuple[int, ...] = ()
     """Indices of the state entries that are MuJoCo's `qpos`, in order; by default the state's first
     half. They must be evenly spaced, as must those of `qvel`.
@@ -152,8 +176,10 @@ class Task(fields.Checked):
     """Id of the Gymnasium environment that this task rebuilds, with the same spaces, initial
     states, rewards and terminations; None if there is none.
     """
-    reference_env: Callable[[], ReferenceEnv] | None = None
+    reference_env: Callable[..., ReferenceEnv] | None = None
     """Function that creates an independent reference for the task's dynamics.
+
+    It is called without arguments, or with the task's options if there is an `apply_options`.
 
     The reference is the Gymnasium environment, or equations of motion in closed form, and accepts
     any force. The analytic physics and the certificate use it.
@@ -204,6 +230,13 @@ class Task(fields.Checked):
                 object.__setattr__(self, name, value)
         check_functions(self)
         check_layout(self)
+
+    def make_reference_env(self, options: Options = None) -> ReferenceEnv:
+        """Create the reference for the task's dynamics with options; None for their defaults."""
+        assert self.reference_env is not None
+        if self.apply_options is None:
+            return self.reference_env()
+        return self.reference_env(self.options() if options is None else options)
 
     @property
     def default_actuator(self) -> str:

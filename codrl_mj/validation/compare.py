@@ -15,6 +15,7 @@ from codrl_mj.actuators import ActuatorModel, CurrentLoop, DCMotorActuator, spec
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationConfig
 from codrl_mj.physics.base import Force
 from codrl_mj.tasks import Task, resolve_actuators
+from codrl_mj.tasks.base import Options
 
 NO_REFERENCE_ENV = (
     "the task has no reference environment (Task.reference_env): there is no second"
@@ -57,17 +58,24 @@ def missing_oracle_reason(task: Task) -> str:
 
 
 def physics_pair(
-    task: Task, actuator: ActuatorModel, integrator: str, max_force: float | None = None
+    task: Task,
+    actuator: ActuatorModel,
+    integrator: str,
+    max_force: float | None = None,
+    options: Options = None,
 ) -> tuple[MujocoPhysics, AnalyticPhysics]:
     """Return a task's simulations in MuJoCo and with Gymnasium's equations.
 
-    `max_force` replaces MuJoCo's limit of the desired force.
+    `max_force` replaces MuJoCo's limit of the desired force; `options` are the task's, None for
+    their defaults.
     """
     steps = task.num_inner_steps(actuator, None, None)
     limits = task.max_forces if max_force is None else np.array([max_force])
     return (
-        MujocoPhysics(SimulationConfig(task, [actuator], steps, integrator, limits)),
-        AnalyticPhysics(SimulationConfig(task, [actuator], steps, integrator)),
+        MujocoPhysics(
+            SimulationConfig(task, [actuator], steps, integrator, limits, options=options)
+        ),
+        AnalyticPhysics(SimulationConfig(task, [actuator], steps, integrator, options=options)),
     )
 
 
@@ -123,18 +131,18 @@ rk4: Callable[[Slope, np.ndarray, Sequence[float]], np.ndarray] = acrobot.rk4
 """(derivative, state, times) -> the state after steps of Gymnasium's Runge-Kutta method."""
 
 
-def gymnasium_equations(task: Task, dt: float | None = None) -> Equations:
+def gymnasium_equations(task: Task, dt: float | None = None, options: Options = None) -> Equations:
     """Return the right-hand side of a task's equations of motion, read from its environment.
 
     No equation is copied. A reference environment may have its right-hand side as a method
     (Acrobot). The others take Euler steps, whose new velocity is v + a*dt. One step of the
     environment therefore gives the acceleration a = (v_new - v)/dt, and the derivative of a
     position is its velocity. The environment's bounds are removed. dt [s] is a power of two, or
-    None for the largest one that is at most a quarter of an environment step.
+    None for the largest one that is at most a quarter of an environment step. `options` are the
+    task's, None for their defaults.
     """
-    assert task.reference_env is not None
     # A reference environment has few declared attributes; bounds are found by their names.
-    env: Any = task.reference_env()
+    env: Any = task.make_reference_env(options)
     if hasattr(env, "derivative"):
         equations: Equations = env.derivative
         return equations

@@ -14,6 +14,7 @@ import numpy as np
 from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
+from codrl_mj.tasks.base import Options
 from codrl_mj.tasks.reference_env import ReferenceStates
 from codrl_mj.validation.compare import (
     differences,
@@ -128,12 +129,31 @@ def one_step(
 @check("dynamics", Check("accelerations", "{task.oracle}", TOLERANCE))
 def accelerations(task: Task, reference: ReferenceStates, points: int) -> Iterator[Case]:
     """Compare `qacc` on a dense grid of states, under no, half, full and extreme forces."""
+    yield _accelerations(task, reference, points)
+
+
+@check("dynamics", Check("accelerations with other options", "{task.oracle}", TOLERANCE))
+def accelerations_with_options(
+    task: Task, reference: ReferenceStates, points: int
+) -> Iterator[Case]:
+    """Compare `qacc` as `accelerations` does, with each of the task's `reference_options`."""
+    for options in task.reference_options:
+        yield _accelerations(task, reference, points, options)
+
+
+def _accelerations(
+    task: Task, reference: ReferenceStates, points: int, options: Options = None
+) -> Case:
+    """Compare `qacc` with options of the task; None for their defaults."""
     states, forces = _crossed(
         grid(reference.bounds, points),
         task.max_force * np.array([-EXTREME, -1.0, 0.0, 0.5, EXTREME]),
     )
-    physics, _ = physics_pair(task, IDEAL, task.integrators[0], max_force=EXTREME * task.max_force)
-    equations, velocities = gymnasium_equations(task, dt=1.0), list(task.qvel)
+    physics, _ = physics_pair(
+        task, IDEAL, task.integrators[0], max_force=EXTREME * task.max_force, options=options
+    )
+    equations = gymnasium_equations(task, dt=1.0, options=options)
+    velocities = list(task.qvel)
     ours, oracle = (np.empty((len(states), len(task.qvel))) for _ in range(2))
     for row, (state, force) in enumerate(zip(states, forces.tolist(), strict=True)):
         physics.reset(state)
@@ -144,7 +164,7 @@ def accelerations(task: Task, reference: ReferenceStates, points: int) -> Iterat
 
     # A state's name may have its unit behind a space, which would not fit into "d.../dt".
     names = [f"d{task.state_names[entry].partition(' ')[0]}/dt at" for entry in velocities]
-    yield _state_case(
+    return _state_case(
         np.abs(ours - oracle) / np.maximum(1.0, np.abs(oracle)), names, states, forces
     )
 
@@ -161,5 +181,6 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     is_planar = len(task.state_names) == 2
     points = (9 if is_planar else 3) if quick else (51 if is_planar else 7)
     yield from accelerations(task, task.reference_states, points)
+    yield from accelerations_with_options(task, task.reference_states, points)
     for integrator in task.integrators:
         yield from one_step(task, task.reference_states, integrator, quick)

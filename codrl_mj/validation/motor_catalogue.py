@@ -128,7 +128,7 @@ class JointOracle:
         self._friction = motor.coulomb_friction / arm
         self._task, self._timestep, self._integrator = task, timestep, integrator
         assert task.reference_env is not None
-        self._reference_env = task.reference_env()
+        self._reference_env = task.make_reference_env()
         self._equations = gymnasium_equations(task)
         self._speed_index = task.speed_indices[0]
         _, slope = self._linear(np.zeros(len(task.state_names)))

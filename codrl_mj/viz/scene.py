@@ -71,7 +71,9 @@ def scene_of(env: EnvConfig) -> Scene:
     if env.source.task is None:
         with contextlib.closing(env.build()) as opened_env:
             return Scene(opened_env.unwrapped.model, None, None)  # type: ignore[attr-defined]
-    task_env = ActuatedEnv(env.source.reference, "ideal")
+    # Options may change the model, such as the lengths of a rig.
+    options = env.source.non_default_options(env.options)
+    task_env = ActuatedEnv(env.source.reference, "ideal", **options)
 
     def pose(state: np.ndarray) -> mujoco.MjData:
         task_env.physics.show(state)

@@ -64,7 +64,9 @@ def test_proposed_columns_are_printed_with_the_next_command(capsys):
     assert "please check: current: no unit is stated: replace UNIT by A or mA" in text
     line = text.splitlines()[-1].removeprefix("codrl-mj identify ")
     assert "current=current:UNIT" in line
-    assert line.endswith("--rig free --known load_inertia=0 --out motor")
+    assert line.endswith("--rig RIG --out motor")
+    assert "--rig RIG: must be one of" in run_identify(capsys, line, 2)
+    line = line.replace("--rig RIG", "--rig free --known load_inertia=0")
     assert "current=current:UNIT: the unit is not filled in" in run_identify(capsys, line, 2)
     units = ("current:A", "position:rad", "velocity:rad/s", "torque:N*m")
     for unit in units:

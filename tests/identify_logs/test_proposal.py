@@ -312,7 +312,9 @@ def test_the_printed_next_command_runs_or_there_is_none(tmp_path, capsys):
     line = out.splitlines()[-1]
     assert status == 0
     assert line.startswith("codrl-mj identify ")
-    assert line.endswith("--rig free --known load_inertia=0 --out motor")
+    assert line.endswith("--rig RIG --out motor")
+    line = line.replace("--rig RIG --out motor", "--rig free --known load_inertia=0")
+    assert run_identify(capsys, *shlex.split(line)[2:])[0] in (0, 1)
     bad = good | {"i_A": -CURRENT}
     status, out, _ = run_identify(capsys, "columns", write_columns(tmp_path, bad))
     line = out.splitlines()[-1]
@@ -335,6 +337,45 @@ def test_the_printed_next_command_runs_or_there_is_none(tmp_path, capsys):
     assert "Feetech: Present Load" in text
     assert "codrl-mj identify" not in out
     assert "--columns time=t_s:s,command=goal_deg:deg,position=present_deg:deg" in out
+
+
+def test_measured_columns_are_preferred_and_other_joints_are_named(tmp_path):
+    """Two joints of a robot: commands, parts of them and filtered signals are not what is fitted."""
+    columns = {"time": TIME}
+    for name, values in (("pos_filt", ANGLE), ("pos_meas", ANGLE), ("vel_meas", SPEED)):
+        columns |= {f"{name}{joint}": values for joint in (1, 2)}
+    for name in ("tau_con", "tau_fric", "tau_meas"):
+        columns |= {f"{name}{joint}": CURRENT for joint in (1, 2)}
+    proposal = propose_columns(write_columns(tmp_path, columns))
+    expected = {
+        "time=time:s",
+        "position=pos_meas1:UNIT",
+        "velocity=vel_meas1:UNIT",
+        "torque=tau_meas1:UNIT",
+    }
+    assert {*proposal.columns.split(",")} == expected
+    assert (
+        "pos_meas1, pos_meas2: several joints, of which pos_meas1 is taken: a fit of one"
+        in (proposal.doubts[-1])
+    )
+
+
+def test_an_input_of_the_plant_is_proposed_as_the_voltage_with_an_open_unit(tmp_path):
+    columns = {"t": TIME, "theta": np.round(ANGLE, 4), "feedforward": VOLTS, "plant_input": VOLTS}
+    proposal = propose_columns(write_columns(tmp_path, columns))
+    assert proposal.problem is None
+    assert proposal.columns.endswith("voltage=plant_input:UNIT")
+    assert not any("plant_input: not known" in doubt for doubt in proposal.doubts)
+    # A column that is a voltage by its name is taken instead.
+    proposal = propose_columns(write_columns(tmp_path, columns | {"u_V": VOLTS}))
+    assert "voltage=u_V:V" in proposal.columns
+
+
+def test_the_command_of_a_pwm_is_the_duty(tmp_path):
+    columns = {"t_s": TIME, "pwm_command": VOLTS / 12.0, "voltage": SUPPLY, "q_rad": ANGLE}
+    assert (
+        "voltage=pwm_command*voltage:V" in propose_columns(write_columns(tmp_path, columns)).columns
+    )
 
 
 def test_a_duty_without_a_supply_gets_a_remedy(tmp_path):

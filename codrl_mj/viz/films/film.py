@@ -107,6 +107,8 @@ class Panel:
     """Text above the scene."""
     motor: int = 0
     """Index of the motor whose signals are plotted."""
+    options: Info = dataclasses.field(default_factory=dict)
+    """Options of the task that differ from their defaults, which may change its scene."""
 
 
 def record(
@@ -126,7 +128,9 @@ def record(
     render_options = render_arguments(env, width, height, None if camera == "fixed" else camera)
     recorders: list[FrameRecorder] = []
     if render_options is None:
-        return Panel(env.task, run_episodes(policy, env.build, 1, seed)[0])
+        options = env.source.non_default_options(env.options)
+        episode = run_episodes(policy, env.build, 1, seed)[0]
+        return Panel(env.task, episode, options=options)
 
     def make_recorder() -> FrameRecorder:
         recorders.append(FrameRecorder(env.build(**render_options), pretty))
@@ -155,7 +159,7 @@ def _scene(
 
         yield recorder.metadata.get("render_fps") or 1.0 / float(episode.time[0]), resized_image
         return
-    env = ActuatedEnv(panel.task, "ideal")
+    env = ActuatedEnv(panel.task, "ideal", **panel.options)
     with contextlib.closing(OffscreenRenderer(env.model, *size, camera, pretty)) as renderer:
 
         def render_state(instant: int) -> np.ndarray:
