@@ -18,6 +18,7 @@ SIGNALS = {
     "duty": "",  # share of the bus voltage
     "temperature": "degC",
     "command": None,  # setpoint of a controller, in any unit
+    "gain": "",  # register of a servo's position gain
 }
 """Signal of a log -> its SI unit; None: any."""
 # Nothing is simulated across a gap.
@@ -315,6 +316,16 @@ MIN_MOTION_STEPS = 10.0
 """Motion in encoder steps below which a shaft counts as locked."""
 
 
+class ServoInputs(NamedTuple):
+    """Commands of a servo until the end of a segment, and what scales its torque."""
+
+    times: np.ndarray  # times of the log's rows until the end of the segment [s], shape (n,)
+    targets: np.ndarray  # commanded positions at these rows [rad], shape (n,)
+    integrals: np.ndarray  # integrals of the held commands over time [rad*s], shape (n,)
+    volts: np.ndarray  # supply voltage over its reference at the segment's rows, shape (m,)
+    gains: np.ndarray  # position gain over its reference at the segment's rows, shape (m,)
+
+
 class Segment(NamedTuple):
     """Rows of a log that are simulated from one initial state."""
 
@@ -328,6 +339,7 @@ class Segment(NamedTuple):
     measured: np.ndarray  # output that a simulation is compared with, shape (m,)
     deviation: float  # standard deviation of the sensor, in the unit of `measured`
     state: np.ndarray  # initial guess of the state at the first row
+    servo: ServoInputs | None = None  # inputs of a servo; None: the segment is not of a servo
 
     def first(self, count: int) -> "Segment":
         """Return a segment of the first `count` rows."""
@@ -467,13 +479,17 @@ def initial_state(log: Log, rows: slice) -> np.ndarray:
 
 
 def halve_rate(log: Log) -> Log:
-    """Return every second row of a log; a mean voltage becomes the mean over both rows."""
+    """Return every second row of a log; mean voltages and commands become means over both rows."""
     # With an odd number of rows, both the first and the last row remain.
     count = len(log.time) - (len(log.time) + 1) % 2
     half = log.slice_rows(slice(0, count, 2))
-    if not (log.mean_voltage and log.has("voltage")):
-        return half
-    steps, volts = np.diff(log.time[:count]), log.signals["voltage"][:count]
-    integrals = volts[:-1] * steps
-    mean = (integrals[::2] + integrals[1::2]) / (steps[::2] + steps[1::2])
-    return replace_signal(half, "voltage", np.append(mean, volts[-1]))
+    steps = np.diff(log.time[:count])
+    # A command is held until the next row. The mean of two commands keeps its integral, so that a
+    # servo's delay does not change.
+    for name in ("voltage", "command"):
+        if log.has(name) and (name == "command" or log.mean_voltage):
+            values = log.signals[name][:count]
+            integrals = values[:-1] * steps
+            mean = (integrals[::2] + integrals[1::2]) / (steps[::2] + steps[1::2])
+            half = replace_signal(half, name, np.append(mean, values[-1]))
+    return half

@@ -16,7 +16,13 @@ import numpy as np
 from codrl_mj.identify.estimate import Fit, Model, fit_warnings, optimize
 from codrl_mj.identify.log import BLOCK_DURATION, Log, halve_rate, has_motion, replace_signal
 from codrl_mj.identify.models import ShaftModel, WindingModel
-from codrl_mj.identify.parameters import DEFAULTS, FRICTION, PARAMETERS, WINDING_SOURCES
+from codrl_mj.identify.parameters import (
+    DEFAULTS,
+    FRICTION,
+    MIN_SIZES,
+    PARAMETERS,
+    WINDING_SOURCES,
+)
 from codrl_mj.identify.result import MAX_UNEXPLAINED, USABLE, Estimate, Status
 
 MIN_LOGS = 5
@@ -63,6 +69,7 @@ CAUSES = {
     "self_test": "a fit to its own simulation gives another value",
     "unexplained": "the model does not explain the current",
     "torque_constant": "the constant of the winding that it depends on is not known better",
+    "row": "a row does not show when within it a command is sent",
 }
 """Cause of an interval's width -> its description."""
 BOUND_MARGIN = 1e-3
@@ -124,7 +131,11 @@ def _assess_part(fit: Fit[Model], seed: int, on_step: Callable[[], None]) -> lis
     # Relative errors refer to the value of a parameter. For a friction parameter they refer to the
     # value at which it alone would account for all friction.
     magnitudes = [
-        full_friction[name] if name in FRICTION else abs(fit.values[index])
+        (
+            full_friction[name]
+            if name in FRICTION
+            else max(abs(fit.values[index]), MIN_SIZES.get(name, 0.0))
+        )
         for index, name in enumerate(names)
     ]
     scales = np.maximum(magnitudes, 1e-6 * model.scales)
@@ -355,15 +366,20 @@ def _total_friction(fit: Fit[Model]) -> tuple[float, dict[str, float], dict[str,
         ]
     )
     speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-9) * parameters["gear_ratio"]
-    inputs = np.concatenate([segment.inputs for segment in fit.segments])
-    torque = (
-        float(np.sqrt(np.mean(inputs**2)))
-        * model.shaft_parameters(fit.values).gain
-        / parameters["gear_ratio"]
-    )
-    slopes = {"coulomb_friction": 1.0, "viscous_friction": speed, "gear_efficiency": -torque}
+    torque = model.driving_torque(fit.values, fit.segments) / parameters["gear_ratio"]
+    slopes = {
+        "coulomb_friction": 1.0,
+        "viscous_friction": speed,
+        "damping": speed,
+        "gear_efficiency": -torque,
+    }
     gear_loss = slopes["gear_efficiency"] * (parameters["gear_efficiency"] - 1.0)
-    friction = parameters["coulomb_friction"] + parameters["viscous_friction"] * speed + gear_loss
+    # A servo has a damping in place of the viscous friction.
+    friction = sum(
+        slopes[name] * parameters.get(name, 0.0)
+        for name in ("coulomb_friction", "viscous_friction", "damping")
+    )
+    friction += gear_loss
     full_friction = {
         name: (friction + 1e-2 * torque) / max(abs(slopes.get(name, 1.0)), 1e-300)
         for name in FRICTION
@@ -543,6 +559,41 @@ def resampled_half_widths(
         correction = t.ppf(0.975, count - 1) / t.ppf(0.975, 1e6) * np.sqrt(count / (count - 1.0))
         resampling = np.maximum(-low, high) * correction
     return {"curvature": curvature, "resampling": resampling, "logs": logs}
+
+
+def log_disagreements(fit: Fit[Model]) -> dict[str, float]:
+    """Return how far the logs' own values lie outside the 99 % intervals of single logs.
+
+    A Gauss-Newton step from the common fit gives the value of a single log, and the differences
+    between its blocks give the standard error of that value. The level of 99 % holds for all
+    parameters together. Parameters that no log contradicts are left out.
+    """
+    from scipy.stats import norm
+
+    names, blocks = fit.model.names, [segment.block for segment in fit.segments]
+    logs = [segment.log for segment in fit.segments]
+    if len(set(logs)) < 2 or not names:
+        return {}
+    scales = np.maximum(np.abs(fit.values), fit.model.scales)
+    limit = norm.ppf(1.0 - 0.005 / len(names))
+    gaps = np.zeros(len(names))
+    for log in sorted(set(logs)):
+        own = [index for index, number in enumerate(logs) if number == log]
+        part = dataclasses.replace(
+            fit,
+            segments=[fit.segments[index] for index in own],
+            residuals=tuple(fit.residuals[index] for index in own),
+            jacobians=tuple(fit.jacobians[index] for index in own),
+        )
+        gradients, matrices = _gauss_newton_sums(part, [blocks[index] for index in own])
+        count = len(gradients)
+        if count < 2:
+            continue
+        inverse = _inverse(matrices.sum(axis=0), scales)
+        steps = gradients @ inverse
+        errors = np.sqrt(count / (count - 1.0) * np.sum((steps - steps.mean(axis=0)) ** 2, axis=0))
+        gaps = np.maximum(gaps, np.abs(steps.sum(axis=0)) - limit * errors)
+    return {name: float(gap) for name, gap in zip(names, gaps, strict=True) if gap > 0.0}
 
 
 def correlations(fit: Fit[Model]) -> dict[str, dict[str, float]]:
