@@ -321,7 +321,6 @@ class ServoInputs(NamedTuple):
 
     times: np.ndarray  # times of the log's rows until the end of the segment [s], shape (n,)
     targets: np.ndarray  # commanded positions at these rows [rad], shape (n,)
-    integrals: np.ndarray  # integrals of the held commands over time [rad*s], shape (n,)
     volts: np.ndarray  # supply voltage over its reference at the segment's rows, shape (m,)
     gains: np.ndarray  # position gain over its reference at the segment's rows, shape (m,)
 
@@ -479,17 +478,13 @@ def initial_state(log: Log, rows: slice) -> np.ndarray:
 
 
 def halve_rate(log: Log) -> Log:
-    """Return every second row of a log; mean voltages and commands become means over both rows."""
+    """Return every second row of a log; a mean voltage becomes the mean over both rows."""
     # With an odd number of rows, both the first and the last row remain.
     count = len(log.time) - (len(log.time) + 1) % 2
     half = log.slice_rows(slice(0, count, 2))
-    steps = np.diff(log.time[:count])
-    # A command is held until the next row. The mean of two commands keeps its integral, so that a
-    # servo's delay does not change.
-    for name in ("voltage", "command"):
-        if log.has(name) and (name == "command" or log.mean_voltage):
-            values = log.signals[name][:count]
-            integrals = values[:-1] * steps
-            mean = (integrals[::2] + integrals[1::2]) / (steps[::2] + steps[1::2])
-            half = replace_signal(half, name, np.append(mean, values[-1]))
-    return half
+    if not (log.mean_voltage and log.has("voltage")):
+        return half
+    steps, volts = np.diff(log.time[:count]), log.signals["voltage"][:count]
+    integrals = volts[:-1] * steps
+    mean = (integrals[::2] + integrals[1::2]) / (steps[::2] + steps[1::2])
+    return replace_signal(half, "voltage", np.append(mean, volts[-1]))

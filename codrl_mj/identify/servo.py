@@ -10,7 +10,7 @@ import numpy as np
 
 from codrl_mj.fields import check_names
 from codrl_mj.identify.duty_law import DutyLaw, fit_duty_law
-from codrl_mj.identify.estimate import Fit, fit_from_starts, optimize
+from codrl_mj.identify.estimate import MAX_COST_RATIO, Fit, fit_from_starts, optimize
 from codrl_mj.identify.friction import FrictionChoice, choose_friction
 from codrl_mj.identify.identify import separate_logs
 from codrl_mj.identify.log import MAX_STEP, MIN_ROWS, Log, gapless_stretches, has_motion
@@ -23,9 +23,10 @@ from codrl_mj.identify.result import (
     fitted_traces,
     predict,
 )
-from codrl_mj.identify.servo_model import SERVO_SEGMENT, ServoModel, angle_errors, is_limited
+from codrl_mj.identify.servo_model import SERVO_SEGMENT, ServoModel, largest_torque
 from codrl_mj.identify.servo_result import IdentifiedServo
 from codrl_mj.identify.uncertainty import (
+    CAUSES,
     MAX_FRICTION,
     MAX_HALF_WIDTH,
     assess_fits,
@@ -49,6 +50,14 @@ _SCALES = ("inertia", "armature", "position_gain", "mgl")
 _ROW_SHARE = 0.5
 """Uncertainty of the delay in rows, because a row does not show when within it a command is sent.
 """
+_LOOP_PERIOD = 1e-3
+"""Time [s] by which the firmware's loop may be late, besides the command."""
+_MIN_SHARE = 0.005
+"""Smallest relative half-width, because no load is weighed and measured more exactly."""
+_EXPLAINED = 1.0
+"""Mean residual, in standard deviations of the sensor, up to which a fit explains the logs."""
+_LIMITED = 0.002
+"""Share of the rows in which the torque must exceed its limit, so that the limit is told."""
 _DELAY_ROWS = 3.0
 """Delay in rows below which an error of the delay is judged by this delay."""
 NUM_STEPS = 12
@@ -259,18 +268,51 @@ def _fit(
     segments = choice.model.segments(logs)
     guessed, starts = choice.model.initial_guess(segments)
     fit, start_fits = fit_from_starts(guessed, segments, starts, on_step)
-    if "stall_torque" in fit.model.names and not is_limited(fit.model, fit.values, segments):
-        keep = [name for name in fit.model.names if name != "stall_torque"]
-        rows = [fit.model.names.index(name) for name in keep]
-        unlimited = dataclasses.replace(
-            fit.model,
-            names=tuple(keep),
-            scales=fit.model.scales[rows],
-            estimated=tuple(name for name in fit.model.estimated if name != "stall_torque"),
-        )
-        fit = optimize(unlimited, segments, fit.values[rows])
-        start_fits = (fit,)
+    if np.mean(np.abs(np.concatenate(fit.residuals))) > _EXPLAINED:
+        limited = _with_limited_torque(fit)
+        fit, start_fits = (fit, start_fits) if limited is None else (limited, (limited,))
+    if "stall_torque" in fit.model.names:
+        stall = fit.values[fit.model.names.index("stall_torque")]
+        if largest_torque(fit.model, fit.values, segments, 1.0 - _LIMITED) < stall:
+            fit = _without_limit(fit)
+            start_fits = (fit,)
     return choice, dataclasses.replace(fit, logs=tuple(logs), start_fits=start_fits)
+
+
+def _with_limited_torque(fit: Fit[ServoModel]) -> Fit[ServoModel] | None:
+    """Return the fit of a servo whose limit applies after the damping, if it is clearly better."""
+    if "stall_torque" not in fit.model.names:
+        return None
+    names, damping = fit.model.names, fit.model.all_values(fit.values)["damping"]
+    model = dataclasses.replace(
+        fit.model,
+        limits_torque=True,
+        names=(*names, "viscous_friction"),
+        scales=np.append(fit.model.scales, max(damping, 1e-9)),
+    )
+    starts = []
+    largest = largest_torque(model, np.append(fit.values, 0.0), fit.segments, 1.0)
+    for share in (0.3, 0.5, 0.8):
+        start = np.append(fit.values, 0.1 * damping)
+        start[names.index("stall_torque")] = share * largest
+        starts.append(start)
+    other, _ = fit_from_starts(model, fit.segments, starts)
+    scale = min(fit.scale, other.scale)
+    return other if other.costs(scale).sum() < MAX_COST_RATIO * fit.costs(scale).sum() else None
+
+
+def _without_limit(fit: Fit[ServoModel]) -> Fit[ServoModel]:
+    """Return the fit of a servo whose torque is not limited."""
+    limited = ("stall_torque", "viscous_friction")
+    rows = [index for index, name in enumerate(fit.model.names) if name not in limited]
+    unlimited = dataclasses.replace(
+        fit.model,
+        names=tuple(fit.model.names[row] for row in rows),
+        scales=fit.model.scales[rows],
+        estimated=tuple(name for name in fit.model.estimated if name != "stall_torque"),
+        limits_torque=False,
+    )
+    return optimize(unlimited, fit.segments, fit.values[rows])
 
 
 def _predictions(fit: Fit[ServoModel], logs: Iterable[Log]) -> tuple[Prediction, ...]:
@@ -290,14 +332,28 @@ def _finish(
     by_name = {estimate.name: estimate for estimate in estimates if estimate.name in _NAMES}
     gaps = log_disagreements(fit)
     row = max(log.step for log in fit.logs)
+    gain = by_name["position_gain"].value
+    total = fit.model.shaft_parameters(fit.values).inertia
     for name, estimate in by_name.items():
-        extra = gaps.get(name, 0.0)
         if estimate.status == "given":
             continue
-        if extra > 0.0:
-            by_name[name] = _widened(estimate, extra, "logs", by_name)
+        if gaps.get(name, 0.0) > 0.0:
+            estimate = _widened(estimate, gaps[name], "logs", by_name)
+        # A loop that is late by T takes gain*T from the damping. The stall torque follows, because
+        # the logs show the speed at which both are equal.
+        if name in ("damping", "friction_torque", "stall_torque"):
+            extra = gain * _LOOP_PERIOD
+            if name == "friction_torque":
+                extra *= _rms_speed(fit)
+            elif name == "stall_torque" and not fit.model.limits_torque:
+                extra *= estimate.value / max(by_name["damping"].value, extra)
+            estimate = _widened(estimate, extra, "loop", by_name)
         if name == "command_delay":
-            by_name[name] = _widened(by_name[name], _ROW_SHARE * row, "row", by_name, row)
+            estimate = _widened(estimate, _ROW_SHARE * row, "row", by_name, row)
+        else:
+            size = total if name == "armature" else abs(estimate.value)
+            estimate = _widened(estimate, _MIN_SHARE * size, "load", by_name)
+        by_name[name] = estimate
     derived = _derived(by_name, fit, arguments, law)
     by_name |= derived
     if not arguments.is_scaled:
@@ -305,8 +361,15 @@ def _finish(
     return [by_name[name] for name in PARAMETERS if name in by_name]
 
 
+def _rms_speed(fit: Fit[ServoModel]) -> float:
+    """Return the RMS of the speeds [rad/s] over the segments."""
+    speeds = [np.diff(one.measured[::20]) / np.diff(one.times[::20]) for one in fit.segments]
+    return float(np.sqrt(np.mean(np.concatenate(speeds) ** 2)))
+
+
 _NAMES = (
-    *("position_gain", "stall_torque", "damping", "armature", "inertia", "load_inertia", "mgl"),
+    *("position_gain", "stall_torque", "damping", "viscous_friction", "armature", "inertia"),
+    *("load_inertia", "mgl"),
     *("coulomb_friction", "stribeck_friction", "stribeck_speed", "gear_efficiency"),
     *("friction_torque", "command_delay", "zero", "max_velocity"),
 )
@@ -333,7 +396,7 @@ def _widened(
     size = max(abs(value), MIN_SIZES.get(name, 0.0), _DELAY_ROWS * row)
     if name in FRICTION and "friction_torque" in by_name:
         size = max(abs(value), abs(by_name["friction_torque"].value) * (name == "coulomb_friction"))
-    return _judged(estimate, half_width / max(size, 1e-300), "the logs disagree")
+    return _judged(estimate, half_width / max(size, 1e-300), CAUSES[cause])
 
 
 def _judged(estimate: Estimate, share: float, cause: str) -> Estimate:
@@ -385,25 +448,23 @@ def _derived(
         # The torque at full duty follows from the gain even if the logs never reach it.
         stall = _ratio("stall_torque", gain, law.estimate)
         derived["stall_torque"] = stall
-    elif stall is not None:
+    elif stall is not None and not fit.model.limits_torque:
         derived["duty_gain"] = dataclasses.replace(
             _ratio("duty_gain", gain, stall), why="if the duty at the limit is 1"
         )
     if stall is None:
-        servo = fit.model.servo_parameters(fit.values)
-        errors = [angle_errors(segment, servo.command_delay) for segment in fit.segments]
-        least = servo.position_gain * float(np.abs(np.concatenate(errors)).max())
+        least = largest_torque(fit.model, fit.values, fit.segments, 1.0)
         derived["stall_torque"] = Estimate(
             "stall_torque",
             least,
             least,
             math.inf,
             "unidentifiable",
-            "the torque never reaches its limit: move faster or further, or log the duty",
+            "the torque reaches no limit, or too rarely: move faster or further, or log the duty",
         )
         return derived
     damping = by_name["damping"]
-    if damping.value > 0.0 and damping.status in USABLE:
+    if damping.value > 0.0 and damping.status in USABLE and not fit.model.limits_torque:
         speed = _ratio("no_load_speed", stall, damping)
         friction = by_name["coulomb_friction"].value / damping.value
         derived["no_load_speed"] = dataclasses.replace(
@@ -412,6 +473,8 @@ def _derived(
             low=max(speed.low - friction, 0.0),
             high=speed.high - friction,
         )
+    if fit.model.limits_torque:
+        return derived
     return derived | _electrical(stall, damping, arguments)
 
 

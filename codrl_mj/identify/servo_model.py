@@ -31,8 +31,7 @@ from codrl_mj.identify.servo_simulation import (
     simulate_position_servo,
 )
 
-# A closed loop forgets its initial state, so that long segments cost no accuracy.
-SERVO_SEGMENT = 2.0
+SERVO_SEGMENT = 1.0
 """Duration [s] of the segments of a servo."""
 NO_LIMIT = PARAMETERS["stall_torque"].upper
 """Stall torque of a servo that never reaches its limit [N*m]."""
@@ -81,17 +80,22 @@ class ServoModel(ShaftModel):
     """Voltage [V] that position gain and stall torque refer to; not a number: none was logged."""
     gain: float = math.nan
     """Register that the position gain refers to; not a number: none was logged."""
+    limits_torque: bool = False
+    """True if the limit applies to the torque after the damping; False: to the duty, before it."""
 
     steps: ClassVar = np.array([1e-4, 1e-2])
+    difference_step: ClassVar = 1e-3
 
     def shaft_parameters(self, values: np.ndarray) -> ShaftParameters:
         """Return the parameters of the shaft, from free parameters of shape (p,)."""
         parameters = self.all_values(values)
         if "inertia" not in parameters:
             parameters["inertia"] = parameters["armature"] + parameters["load_inertia"]
-        parameters["viscous_friction"] = 0.0
+        # Only a limit of the torque tells the servo's own damping from the viscous friction.
+        viscous = parameters.get("viscous_friction", 0.0) if self.limits_torque else 0.0
+        parameters["viscous_friction"] = viscous
         # Friction that grows with the load applies to the torque that is left after the back-EMF.
-        return shaft_parameters(parameters, 1.0, parameters["damping"])
+        return shaft_parameters(parameters, 1.0, max(parameters["damping"] - viscous, 0.0))
 
     def servo_parameters(self, values: np.ndarray) -> ServoParameters:
         """Return the parameters of the control law, from free parameters of shape (p,)."""
@@ -101,30 +105,32 @@ class ServoModel(ShaftModel):
             parameters.get("stall_torque", NO_LIMIT),
             parameters["command_delay"],
             parameters["zero"],
+            float(self.limits_torque),
         )
 
     def simulator(self, values: np.ndarray) -> Simulate:
         """Return a function that simulates the positions [rad] of a segment."""
         shaft, servo = self.shaft_parameters(values), self.servo_parameters(values)
+        undamped = shaft._replace(braking=0.0)
         max_velocity = self.all_values(values)["max_velocity"]
 
         def simulate(segment: Segment, state: np.ndarray) -> np.ndarray:
             inputs = segment.servo
             assert inputs is not None
-            integrals = inputs.integrals
+            targets = inputs.targets
             if max_velocity < PARAMETERS["max_velocity"].upper:
-                targets = limit_rate(inputs.times, inputs.targets, max_velocity)
-                integrals = _integral(inputs.times, targets)
+                targets = limit_rate(inputs.times, targets, max_velocity)
             return simulate_position_servo(
                 segment.times,
                 inputs.times,
-                integrals,
+                targets,
                 inputs.volts,
                 inputs.gains,
                 state[0],
                 state[1],
                 servo,
                 shaft,
+                undamped,
             )
 
         return simulate
@@ -136,7 +142,6 @@ class ServoModel(ShaftModel):
         for index, log in enumerate(logs):
             position, deviation = log.signals["position"], sensor_deviation(log, "position")
             targets = log.signals["command"]
-            integrals = _integral(log.time, targets)
             ones = np.ones(len(log.time))
             volts = log.signals["bus"] / self.supply_voltage if log.has("bus") else ones
             gains = log.signals["gain"] / self.gain if log.has("gain") else ones
@@ -161,12 +166,23 @@ class ServoModel(ShaftModel):
                         ServoInputs(
                             log.time[until],
                             targets[until],
-                            integrals[until],
                             volts[rows],
                             gains[rows],
                         ),
                     )
                 )
+        return segments
+
+    def half_rate_segments(self, logs: Sequence[Log]) -> list[Segment]:
+        """Cut logs into segments of which every second position counts, but every command."""
+        segments = []
+        for segment in self.segments(logs):
+            inputs = segment.servo
+            assert inputs is not None
+            half = inputs._replace(volts=inputs.volts[::2], gains=inputs.gains[::2])
+            arrays = ("times", "inputs", "slopes", "speeds", "measured")
+            thinned = {name: getattr(segment, name)[::2] for name in arrays}
+            segments.append(segment._replace(servo=half, **thinned))
         return segments
 
     def driving_torque(self, values: np.ndarray, segments: Sequence[Segment]) -> float:
@@ -294,11 +310,6 @@ class ServoModel(ShaftModel):
         return _Candidate(start, sizes)
 
 
-def _integral(times: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return the integral of targets that are held from row to row, shape (n,)."""
-    return np.append(0.0, np.cumsum(targets[:-1] * np.diff(times)))
-
-
 def delayed_commands(segment: Segment, times: np.ndarray, delay: float) -> np.ndarray:
     """Return the held command at times, late by a delay."""
     inputs = segment.servo
@@ -390,9 +401,20 @@ def _trapezoids(times: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.append(0.0, np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(times)))
 
 
-def is_limited(model: ServoModel, values: np.ndarray, segments: Sequence[Segment]) -> bool:
-    """Return True if the torque of a fitted servo reaches its limit in at least one percent."""
-    servo = model.servo_parameters(values)
-    errors = np.concatenate([angle_errors(segment, servo.command_delay) for segment in segments])
-    return float(np.mean(servo.position_gain * np.abs(errors) >= servo.stall_torque)) >= 0.01
+def largest_torque(
+    model: ServoModel, values: np.ndarray, segments: Sequence[Segment], share: float
+) -> float:
+    """Return the torque [N*m] that the law of a servo does not exceed in a share of the rows.
 
+    It is the torque at standstill for the angle error, or after the damping if that is limited.
+    """
+    servo, damping = model.servo_parameters(values), model.shaft_parameters(values).braking
+    torques = []
+    for segment in segments:
+        torque = servo.position_gain * angle_errors(segment, servo.command_delay)
+        if model.limits_torque:
+            torque -= damping * smoothed_speeds(
+                segment.times, segment.measured, segment.times, _WINDOW
+            )
+        torques.append(np.abs(torque))
+    return float(np.quantile(np.concatenate(torques), share))

@@ -13,6 +13,9 @@ from codrl_mj.compile_cache import njit
 from codrl_mj.identify.parameters import ShaftParameters
 from codrl_mj.identify.simulation import MAX_SUBSTEP, step_shaft
 
+MIN_SUBSTEP = 1e-9
+"""Duration [s] below which a substep is left out."""
+
 
 class ServoParameters(NamedTuple):
     """Parameters of a servo's control law, at its output."""
@@ -21,6 +24,9 @@ class ServoParameters(NamedTuple):
     stall_torque: float  # largest torque at standstill [N*m]
     command_delay: float  # [s]
     zero: float  # position [rad] at which a pendulum hangs
+    # 1: the limit applies to the torque after the damping, as for a current loop; 0: before it, as
+    # for a duty.
+    limits_torque: float
 
 
 @njit(nogil=True, error_model="numpy")
@@ -38,56 +44,59 @@ def limit_rate(times: np.ndarray, targets: np.ndarray, max_velocity: float) -> n
 def simulate_position_servo(
     times: np.ndarray,
     log_times: np.ndarray,
-    integrals: np.ndarray,
+    targets: np.ndarray,
     volts: np.ndarray,
     gains: np.ndarray,
     position: float,
     speed: float,
     servo: ServoParameters,
     parameters: ShaftParameters,
+    undamped: ShaftParameters,
 ) -> np.ndarray:
     """Return the positions [rad] of a servo at the times, shape (m,).
 
     Args:
         times: times of the result [s], shape (m,).
-        log_times: times of the rows of the log until the last of `times` [s], shape (n,), n > 1.
-        integrals: integral of the target position over time, at these rows [rad*s], shape (n,). It
-            is linear between rows, so that a command is held. Before the first row and after the
-            last one it continues with the same slope.
+        log_times: times of the rows of the log until the last of `times` [s], shape (n,).
+        targets: target positions at these rows [rad], each held until the next row, shape (n,).
         volts: supply voltage over its reference at `times`, shape (m,).
         gains: position gain over its reference at `times`, shape (m,).
         position: initial position [rad].
         speed: initial speed [rad/s].
         servo: parameters of the control law.
         parameters: parameters of the shaft, with a gain of 1.
+        undamped: the same parameters without the damping of the servo.
     """
     positions = np.empty(len(times))
     positions[0] = position
     position -= servo.zero
-    row, last = 0, len(log_times) - 2
-    # The mean target of a substep is exact, so that the positions are smooth in the delay.
-    edge = times[0] - servo.command_delay
-    while row < last and log_times[row + 1] <= edge:
+    row, last, delay = 0, len(log_times) - 1, servo.command_delay
+    while row < last and log_times[row + 1] + delay <= times[0]:
         row += 1
-    slope = (integrals[row + 1] - integrals[row]) / (log_times[row + 1] - log_times[row])
-    integral = integrals[row] + slope * (edge - log_times[row])
     for index in range(len(times) - 1):
-        duration = times[index + 1] - times[index]
-        substeps = max(math.ceil(duration / MAX_SUBSTEP - 1e-6), 1)
-        step = duration / substeps
+        time, end = times[index], times[index + 1]
         gain = servo.position_gain * volts[index] * gains[index]
         limit = servo.stall_torque * volts[index]
-        for _ in range(substeps):
-            edge += step
-            while row < last and log_times[row + 1] <= edge:
+        while end - time > MIN_SUBSTEP:
+            # A substep ends where the next command arrives. Otherwise the torque's limit would
+            # begin up to a substep too early, and the positions would not be smooth in the delay.
+            while row < last and log_times[row + 1] + delay <= time + MIN_SUBSTEP:
                 row += 1
-            slope = (integrals[row + 1] - integrals[row]) / (log_times[row + 1] - log_times[row])
-            next_integral = integrals[row] + slope * (edge - log_times[row])
-            target = (next_integral - integral) / step - servo.zero
-            integral = next_integral
+            arrival = log_times[row + 1] + delay if row < last else end
+            until = min(end, arrival)
+            step = (until - time) / max(math.ceil((until - time) / MAX_SUBSTEP - 1e-6), 1)
             # The error in the middle of a substep makes the step accurate to second order.
-            torque = gain * (target - position - 0.5 * step * speed)
-            torque = min(max(torque, -limit), limit)
-            position, speed = step_shaft(step, torque, 0.0, position, speed, parameters)
+            torque = gain * (targets[row] - servo.zero - position - 0.5 * step * speed)
+            if servo.limits_torque == 0.0:
+                torque = min(max(torque, -limit), limit)
+                position, speed = step_shaft(step, torque, 0.0, position, speed, parameters)
+            else:
+                after = step_shaft(step, torque, 0.0, position, speed, parameters)
+                torque -= 0.5 * parameters.braking * (speed + after[1])
+                if abs(torque) > limit:
+                    torque = math.copysign(limit, torque)
+                    after = step_shaft(step, torque, 0.0, position, speed, undamped)
+                position, speed = after
+            time += step
         positions[index + 1] = position + servo.zero
     return positions

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from codrl_mj.identify.estimate import Fit, Model, fit_warnings, optimize
-from codrl_mj.identify.log import BLOCK_DURATION, Log, halve_rate, has_motion, replace_signal
+from codrl_mj.identify.log import BLOCK_DURATION, Log, has_motion, replace_signal
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import (
     DEFAULTS,
@@ -69,6 +69,8 @@ CAUSES = {
     "self_test": "a fit to its own simulation gives another value",
     "unexplained": "the model does not explain the current",
     "torque_constant": "the constant of the winding that it depends on is not known better",
+    "loop": "the period of the firmware's loop is unknown",
+    "load": "loads are not known more exactly",
     "row": "a row does not show when within it a command is sent",
 }
 """Cause of an interval's width -> its description."""
@@ -374,16 +376,15 @@ def _total_friction(fit: Fit[Model]) -> tuple[float, dict[str, float], dict[str,
         "gear_efficiency": -torque,
     }
     gear_loss = slopes["gear_efficiency"] * (parameters["gear_efficiency"] - 1.0)
-    # A servo has a damping in place of the viscous friction.
-    friction = sum(
-        slopes[name] * parameters.get(name, 0.0)
-        for name in ("coulomb_friction", "viscous_friction", "damping")
-    )
-    friction += gear_loss
+    # The damping of a servo contains its viscous friction.
+    viscous = parameters.get("damping", parameters.get("viscous_friction", 0.0))
+    friction = parameters["coulomb_friction"] + viscous * speed + gear_loss
     full_friction = {
         name: (friction + 1e-2 * torque) / max(abs(slopes.get(name, 1.0)), 1e-300)
         for name in FRICTION
     }
+    if "damping" in parameters:
+        slopes["viscous_friction"] = 0.0
     return (
         friction,
         slopes,
@@ -496,7 +497,8 @@ def interval_causes(
     # If an error is proportional to the time step, halving the rate changes the fit by as much as
     # the error at the full rate. If the error grows only with the root of the step, it is larger
     # than that change. For a winding the change is therefore doubled.
-    half_rate_values = _refit_values(fit, [halve_rate(log) for log in fit.logs])
+    half_rate = fit.model.half_rate_segments(fit.logs)
+    half_rate_values = optimize(fit.model, half_rate, fit.values, 20).values
     causes["half_rate"] = (2.0 if is_winding else 1.0) * np.abs(
         matrix @ (half_rate_values - fit.values)
     )

@@ -12,7 +12,7 @@ GRAVITY = 9.81
 COUNTS = 4096
 KINDS = ("bam", "bam_m3", "mujoco_position", "mujoco_dcmotor", "pwm")
 """Simulations: BAM's equations with friction M1 and M3, MuJoCo's actuators, a servo with PWM."""
-STEP = 5e-4
+STEP = 1e-4
 """Time step of the simulations [s]."""
 
 
@@ -139,14 +139,14 @@ def simulate_bam(servo, targets):
 def simulate_pwm(servo, targets, period=2e-3, bits=10):
     """Return positions and duties of a servo whose firmware runs every 2 ms with a PWM of 10 bits.
 
-    The shaft is integrated at a tenth of the step by explicit equations that hold it while its
+    The shaft is integrated at half the step by explicit equations that hold it while its
     friction exceeds all other torques.
     """
     position = speed = duty = 0.0
     inertia = servo.load_inertia + servo.armature
     slope = servo.torque_constant**2 / servo.resistance + servo.viscous
     positions, duties = np.empty(len(targets)), np.empty(len(targets))
-    every, fine, levels = round(period / STEP), STEP / 10.0, 2.0**bits
+    every, fine, levels = round(period / STEP), STEP / 2.0, 2.0**bits
     for row, target in enumerate(targets):
         positions[row] = position
         if row % every == 0:
@@ -154,7 +154,7 @@ def simulate_pwm(servo, targets, period=2e-3, bits=10):
             duty = min(max(servo.duty_gain * (target - read), -1.0), 1.0)
             duty = round(duty * levels) / levels
         duties[row] = duty
-        for _ in range(10):
+        for _ in range(2):
             torque = servo.stall_torque * duty - slope * speed
             torque -= servo.mgl * math.sin(position - servo.zero)
             if speed == 0.0:
@@ -183,7 +183,7 @@ def simulate_mujoco(servo, targets, kind):
         f"""<mujoco><option timestep="{STEP}" integrator="implicitfast" gravity="0 0 -{GRAVITY}"/>
         <worldbody><body><joint name="hinge" axis="0 1 0" damping="{servo.viscous}"
         frictionloss="{servo.coulomb}" armature="{servo.armature}" solreffriction="0.001 1"/>
-        <inertial mass="{servo.mass}" pos="{-servo.length * math.sin(servo.zero)} 0
+        <inertial mass="{servo.mass}" pos="{servo.length * math.sin(servo.zero)} 0
         {-servo.length * math.cos(servo.zero)}" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody>
         <actuator>{actuator}</actuator></mujoco>"""
     )
