@@ -262,6 +262,11 @@ def find_obstacle(logs: Sequence[Log]) -> Finding | None:
     return None
 
 
+def is_servo_log(log: Log) -> bool:
+    """Return True if a log has commands and positions, from which a servo can be identified."""
+    return log.has("command", "position") and has_motion(log)
+
+
 def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
     """Return a finding that names the signals that a fit lacks, and how to get them."""
     signals = set().union(*(log.signals for log in logs))
@@ -274,9 +279,10 @@ def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
                 " supply has 12 V"
             )
         elif "command" in signals:
-            remedy += (
-                "; for a servo, log the duty (Feetech: Present Load, Dynamixel: Present PWM) and"
-                " the input voltage"
+            remedy = (
+                "identify the servo as a whole: codrl-mj identify servo. It tells more if you also"
+                " log the duty (Feetech: Present Load, Dynamixel: Present PWM) and the input"
+                " voltage"
             )
     elif is_moving:
         lacking = "no torque, current or voltage that all moving logs have"
