@@ -299,6 +299,7 @@ MOTORS = {
     "lag": "lag",
     "torque_speed": "torque_speed",
     "servo": "servo",
+    "pwm_servo": {"name": "feetech-sts3215-7v4", "family": "pwm_servo"},
 }
 """Name -> actuator of a family other than the paper's."""
 FAMILIES = ("HalfCheetah-v5", "Hopper-v5", "InvertedPendulum-v5")
@@ -312,7 +313,7 @@ def behind_motors() -> Entries:
             for num_envs in (None, 4):
                 arguments = {"actuator": actuator, "allow_unstable": True}
                 # A servo is refused if the angle wraps.
-                arguments |= {"action": "position"} if name == "servo" else {}
+                arguments |= {"action": "position"} if "servo" in name else {}
                 try:
                     digested = trajectory(task, num_envs, arguments, SIGNALS[:5], 60)
                 except ValueError:
@@ -407,7 +408,7 @@ def furuta() -> Entries:
         **{
             name: {"actuator": actuator, "allow_unstable": True}
             for name, actuator in MOTORS.items()
-            if name not in ("warm", "servo")
+            if name not in ("warm", "servo", "pwm_servo")
         },
         "default": {"observe_actuator": True},
         "analytic": {"physics": "analytic", "actuator": "ideal"},

@@ -10,6 +10,7 @@ from codrl_mj.actuators.current_loop import (
 )
 from codrl_mj.actuators.drive import Drive, VoltageDrive
 from codrl_mj.actuators.gear_motor import GearMotor
+from codrl_mj.actuators.geared import Geared
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.lag import Lag
 from codrl_mj.actuators.model import (
@@ -51,6 +52,7 @@ from codrl_mj.actuators.parameters import (
     parameter_paths,
     parameters_type,
 )
+from codrl_mj.actuators.pwm_servo import PwmLoop, PwmServo
 from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
 from codrl_mj.actuators.stability import check_stable, spectral_radii, spectral_radius
@@ -70,12 +72,15 @@ __all__ = [
     "Drive",
     "Family",
     "GearMotor",
+    "Geared",
     "Ideal",
     "Inputs",
     "JointAdditions",
     "Lag",
     "Motor",
     "Empty",
+    "PwmLoop",
+    "PwmServo",
     "SampledLoop",
     "Servo",
     "ServoLoop",

@@ -10,23 +10,17 @@ the torque that moved the load.
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping
-from typing import ClassVar, NamedTuple, Self
+from collections.abc import Callable, Mapping
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import sampled, shaft, stability
 from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.gear_motor import GearMotor
-from codrl_mj.actuators.model import (
-    ActuatorModel,
-    Command,
-    FamilyTuple,
-    Inputs,
-    JointAdditions,
-    UnstableError,
-)
-from codrl_mj.actuators.parameters import Parameters, parameters_type
+from codrl_mj.actuators.geared import Geared
+from codrl_mj.actuators.model import Command, FamilyTuple, Inputs, UnstableError
+from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
 from codrl_mj.actuators.shaft import Shaft, StepAverages, TemperatureRises, Winding
 from codrl_mj.catalogue import MotorParameters
@@ -96,10 +90,10 @@ def limit_current(
     return min(max(current, -limit), limit)
 
 
-def begin_step(
+def begin_shaft(
     parameters: Parameters, timestep: float, state: FamilyTuple, inputs: Inputs
-) -> tuple[Winding, TemperatureRises, Shaft]:
-    """Return winding, temperatures and shaft at the beginning of a step, from a drive's state."""
+) -> Shaft:
+    """Return the shaft at the beginning of a step, from the state of a drive or a servo."""
     inertia, external_acceleration = shaft.inertia_of(parameters, inputs.inertia), 0.0
     # The estimate needs the previous step. A step that begins at another time than expected follows
     # a reset or a stage of Runge-Kutta.
@@ -111,7 +105,14 @@ def begin_step(
         external_acceleration = shaft.estimate_external_acceleration(
             timestep, inputs.speed - state.speed, state.acceleration, state.external_acceleration
         )
-    rotor = Shaft(inertia, external_acceleration, inputs.speed)
+    return Shaft(inertia, external_acceleration, inputs.speed)
+
+
+def begin_step(
+    parameters: Parameters, timestep: float, state: FamilyTuple, inputs: Inputs
+) -> tuple[Winding, TemperatureRises, Shaft]:
+    """Return winding, temperatures and shaft at the beginning of a step, from a drive's state."""
+    rotor = begin_shaft(parameters, timestep, state, inputs)
     winding = Winding(state.current, state.integral, state.pending)
     return winding, TemperatureRises(state.winding_rise, state.housing_rise), rotor
 
@@ -201,7 +202,7 @@ def observe(
 
 
 @dataclasses.dataclass(frozen=True)
-class Drive(ActuatorModel):
+class Drive(Geared):
     """Motor with its gear, the drive's current loop and the supply.
 
     Raises:
@@ -245,43 +246,6 @@ class Drive(ActuatorModel):
         )
 
     @property
-    def arm_radius(self) -> float:
-        """Arm [m] between the rotor and the load, including the gear."""
-        return self.motor.arm_radius / self.motor.gear_ratio
-
-    @property
-    def additions(self) -> JointAdditions:
-        """Rotor inertia and friction, as seen from the load."""
-        arm, motor = self.arm_radius, self.motor
-        return JointAdditions(
-            motor.rotor_inertia / (arm * arm),
-            motor.viscous_friction / (arm * arm),
-            motor.coulomb_friction / arm,
-        )
-
-    @property
-    def back_emf_damping(self) -> float:
-        """Damping kT*kE/R at the load through the gear, as in `ActuatorModel.back_emf_damping`."""
-        motor = self.motor
-        braking = motor.torque_constant * motor.back_emf_constant / motor.resistance
-        return motor.gear_efficiency * braking / self.arm_radius**2
-
-    @property
-    def winding(self) -> tuple[float, float]:
-        """Resistance [ohm] and inductance [H]."""
-        return self.motor.resistance, self.motor.inductance
-
-    @property
-    def voltage_limit(self) -> float:
-        """Voltage [V] of the supply."""
-        return 24.0 if self.supply is None else self.supply.voltage
-
-    @property
-    def supply_resistance(self) -> float:
-        """Internal resistance [ohm] of the supply, by which its voltage drops under a current."""
-        return 0.0 if self.supply is None else self.supply.resistance
-
-    @property
     def assumed(self) -> str:
         """Unspecified supply, current limit, inertia and constants; see `ActuatorModel.assumed`."""
         motor = self.motor
@@ -307,17 +271,6 @@ class Drive(ActuatorModel):
             assumption for assumption, is_missing in missing.items() if is_missing
         )
         return f"assumed, because not specified: {assumptions}" if assumptions else ""
-
-    @classmethod
-    def from_parameter_values(
-        cls, parameter_values: Iterable[float], arm_radius: float = 1.0
-    ) -> Self:
-        """Return the drive with these parameters.
-
-        The arm is that between rotor and load; the gear ratio is one of the parameters.
-        """
-        gear_ratio = parameters_type(cls)(*parameter_values).gear_ratio
-        return super().from_parameter_values(parameter_values, arm_radius * gear_ratio)
 
     def commands(self) -> Mapping[str, Command]:
         """Return the commands `current` [A], within `max_current`, and terminal `voltage` [V]."""

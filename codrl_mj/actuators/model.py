@@ -148,8 +148,12 @@ class ActuatorModel(fields.Checked):
         super().__init_subclass__(**kwargs)
         # Validation simulates edited copies of these modules. Their classes have the same import
         # path, and must not replace the originals.
-        if cls.__module__.startswith("codrl_mj.actuators.") and import_path(cls) not in map(
-            import_path, BUILT_IN
+        # A class without `advance` is a base class of families.
+        is_family = cls.advance is not ActuatorModel.advance
+        if (
+            is_family
+            and cls.__module__.startswith("codrl_mj.actuators.")
+            and import_path(cls) not in map(import_path, BUILT_IN)
         ):
             BUILT_IN.append(cls)
             if name := vars(cls).get("family"):

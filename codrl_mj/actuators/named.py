@@ -12,12 +12,15 @@ from typing import Any, TypeGuard, TypeVar
 from codrl_mj.actuators.current_loop import CurrentLoop, DCMotorActuator
 from codrl_mj.actuators.drive import Drive
 from codrl_mj.actuators.gear_motor import GearMotor
+from codrl_mj.actuators.geared import Geared
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name
 from codrl_mj.actuators.parameters import FieldValue
+from codrl_mj.actuators.pwm_servo import PwmServo
 from codrl_mj.actuators.servo import Servo
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 from codrl_mj.catalogue import joint_names, motor_entry, motor_names
+from codrl_mj.fields import declared_nested_types
 from codrl_mj.user_code import allow_imports_from_files, look_up, read_yaml
 
 Named = TypeVar("Named", bound=ActuatorModel)
@@ -368,8 +371,11 @@ def override_actuator(base: ActuatorModel, changes: Mapping[str, FieldValue]) ->
         kind = _related_family(family, kind)
     _check_fields(fields_set, kind)
     merged: dict[str, FieldValue] = {
-        key: value for key, value in base.as_mapping().items() if key in _field_names(kind)
+        key: value for key, value in base.as_mapping().items() if key in _shared(kind, type(base))
     }
+    loop_fields = fields_set.get("loop", {})
+    if issubclass(kind, PwmServo) and type(base) is not kind and isinstance(loop_fields, Mapping):
+        merged["loop"] = kind.factory_settings(display_label(base), loop_fields)
     for name, value in fields_set.items():
         inner = merged.get(name)
         merged[name] = {**(inner or {}), **value} if isinstance(value, Mapping) else value
@@ -377,9 +383,9 @@ def override_actuator(base: ActuatorModel, changes: Mapping[str, FieldValue]) ->
     if (
         isinstance(actuator, Servo)
         and not isinstance(base, Servo)
-        and isinstance(fields_set.get("loop", {}), Mapping)
+        and isinstance(loop_fields, Mapping)
     ):
-        actuator = actuator.with_default_gain(fields_set.get("loop", {}))
+        actuator = actuator.with_default_gain(loop_fields)
     # The plain name of a catalogue motor means its drive, so for other families the label includes
     # the family.
     label = display_label(base).removesuffix(_CHANGED)
@@ -397,21 +403,23 @@ def override_actuator(base: ActuatorModel, changes: Mapping[str, FieldValue]) ->
 
 
 def _related_family(family: str, kind: Family) -> Family:
-    """Return the family with a name, which must be a subclass or base class of `kind`.
+    """Return the family with a name, which must have a motor as `kind` has, or be related to it.
 
     A servo is a drive with outer loops, so a drive's motor, controller and supply become a servo's,
-    and back.
+    and back. Motor and supply become those of a `pwm_servo`.
 
     Raises:
         ValueError: there is no such family, or it is not related to the kind.
     """
     related = find_family(family)
-    if not (issubclass(related, kind) or issubclass(kind, related)):
+    if not all(issubclass(family, Geared) for family in (related, kind)) and not (
+        issubclass(related, kind) or issubclass(kind, related)
+    ):
         raise ValueError(
             f"family = {family!r}: cannot replace the family {family_name(kind)!r}, which has"
             f" different fields. Name an actuator of a related family, or leave out the name and"
             f" specify all fields of family {family!r}. Motors of `codrl-mj motor list` and of"
-            " datasheets are drives, which can become servos"
+            " datasheets are drives, which can become a servo or a pwm_servo"
         )
     return related
 
@@ -419,6 +427,16 @@ def _related_family(family: str, kind: Family) -> Family:
 def _field_names(kind: Family) -> set[str]:
     """Return the names of a family's fields."""
     return {field.name for field in dataclasses.fields(kind)}
+
+
+def _shared(kind: Family, base: Family) -> set[str]:
+    """Return the names of the fields that two families share, with parts of the same kind."""
+    parts, base_parts = (declared_nested_types(family) for family in (kind, base))
+    return {
+        name
+        for name in _field_names(kind) & _field_names(base)
+        if parts.get(name) == base_parts.get(name)
+    }
 
 
 def _check_fields(names: Iterable[str], kind: Family) -> None:

@@ -257,8 +257,14 @@ class Joints(NamedTuple):
 
 PERTURBATION = -1e-6
 """Perturbation added to each state in turn. It is negative, so a counter that is due stays due."""
-WITHOUT_FRICTION = {"stribeck_friction": 0.0, "gear_efficiency": 1.0, "deadband": 0.0}
-"""Parameter values without friction and dead zone, which would hide small motions."""
+WITHOUT_FRICTION = {
+    "stribeck_friction": 0.0,
+    "gear_efficiency": 1.0,
+    "deadband": 0.0,
+    "start_duty": 0.0,
+    "encoder_counts": 0.0,
+}
+"""Parameter values without friction, dead zone and resolution, which would hide small motions."""
 
 
 def linearize(

@@ -9,11 +9,12 @@ from typing import Annotated, Literal
 
 import tyro
 
-from codrl_mj.actuators import ActuatorModel, Drive, TorqueSpeed, resolve
+from codrl_mj.actuators import ActuatorModel, ActuatorSetting, Drive, TorqueSpeed, resolve
 from codrl_mj.arrays.written_losses import LostField, WrittenComparison
 from codrl_mj.boundary import Argument
 from codrl_mj.catalogue import MotorEntry, TorqueSpeedLine, joint_names
 from codrl_mj.cli.parsing import AsJson, Output
+from codrl_mj.cli.servo import AsServo, ServoSettings, analyze_position_servo, print_servo
 from codrl_mj.cli.terminal import format_number, print_table, print_text
 from codrl_mj.fields import command
 from codrl_mj.plots import Plot
@@ -54,7 +55,7 @@ class Changes:
     max_current: float | None = None
     """Current limit of the drive [A]."""
 
-    def drive(self, name: str) -> Drive:
+    def drive(self, name: ActuatorSetting) -> Drive:
         """Return the named drive, changed to these values."""
         from codrl_mj.sizing import find_drive
 
@@ -143,32 +144,40 @@ class Show:
     part of the voltage), the peak current and the continuous current, at the output of the gear and
     with friction subtracted. It covers all four quadrants, both driving and braking. The shaded
     area is available for short times only. A motor known only by its torque-speed line has a table
-    of this line, and no diagram.
+    of this line, and no diagram. A servo that takes positions also has its step response, its error
+    under a load and its bandwidth.
 
     Example: codrl-mj motor show maxon-ec45-flat-50w --gear-ratio 12 --out motor
+    Example: codrl-mj motor show feetech-sts3215-7v4 --family pwm_servo --position-p 32 --out servo
     """
 
     name: MotorName
     changes: Settings = Changes()
+    servo: AsServo = ServoSettings()
     out: Path | None = None
-    """Folder for torque_speed.png."""
+    """Folder for torque_speed.png, and servo.png if it is a servo."""
     html: Path | None = None
-    """HTML file for a page with these tables, the current loop and its step responses."""
+    """HTML file for a page with these tables, the current loop and its step responses, or the
+    responses of a servo.
+    """
     as_json: AsJson = False
 
     def run(self) -> Output:
         """Print the tables and draw the diagram."""
-        from codrl_mj.sizing import describe_motor, find_entry, find_loop
+        from codrl_mj.sizing import describe_motor, find_entry, find_servo
 
         entry = find_entry(self.name)
         line = None if entry is None else entry.line
         # Without a winding there is no diagram, no loop and nothing to change: naming the drive
         # says so.
         is_plain = self.out is None and self.html is None and self.changes == Changes()
-        if entry is not None and line is not None and is_plain:
+        if entry is not None and line is not None and is_plain and self.servo == ServoSettings():
             return _print_line(entry, line)
-        drive = self.changes.drive(self.name)
-        explanation = describe_motor(drive, entry, find_loop(self.name))
+        setting = self.servo.setting(self.name)
+        drive = self.changes.drive(setting)
+        servo = find_servo(setting, drive)
+        explanation = describe_motor(drive, entry, None if servo is None else servo.loop)
+        response = None if servo is None else analyze_position_servo(servo, self.servo.inertia)
         if self.out is not None:
             from codrl_mj.viz.pages.diagrams import torque_speed_diagram
 
@@ -176,14 +185,19 @@ class Show:
         _print_explanation(
             f"{self.name}: {entry.title}" if entry else "", drive.voltage_limit, explanation
         )
+        content = {} if servo is None else print_servo(servo, response)
         if self.html is not None:
             from codrl_mj.viz.pages.motor import motor_page
 
-            motor_page(self.name, drive, entry, self.html)
+            motor_page(self.name, drive, entry, self.html, servo, response)
             print(f"wrote {self.html}")
         if self.out is not None:
             save_plot(figure, self.out / "torque_speed.png")
-        return 0, explanation
+            if servo is not None and response is not None:
+                from codrl_mj.viz.pages.servo_diagrams import servo_plots
+
+                save_plot(servo_plots(servo, response), self.out / "servo.png")
+        return 0, {**explanation, **content}
 
 
 def _print_line(entry: MotorEntry, line: TorqueSpeedLine) -> Output:

@@ -186,7 +186,9 @@ def _raise_unknown_words(tokens: Sequence[str], help_text: str, program: str) ->
     if "--actuator" in known_flags and (owners := _families_with(flag)):
         hint = f"this actuator has no such field; a {' or a '.join(owners)} has; "
         hint += (
-            "add --actuator.family servo to make a motor a servo; " if owners == ["servo"] else ""
+            f"add --actuator.family {owners[0]} to make a motor a servo; "
+            if {*owners} <= {"servo", "pwm_servo"}
+            else ""
         )
     raise ValueError(f"unknown flag {flag}: {hint}{program} --help lists them")
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, Drive, Ideal, shaft
+from codrl_mj.actuators import ActuatorModel, Geared, Ideal, shaft
 from codrl_mj.boundary import Json
 from codrl_mj.envs.config import EnvConfig, check_time_limit, find_source
 from codrl_mj.evaluation.episodes import Episode, run_episodes
@@ -446,8 +446,8 @@ def _energies(trace: MotorTrace) -> tuple[float, float, float, float, float]:
     resistance, inductance = trace.actuator.winding
     stored = inductance * trace.current[-1] ** 2 / 2
     # An integration step of a drive is long compared to its winding's time constant, so the samples
-    # of the current do not give the energies. The drive integrates them within each step.
-    if isinstance(trace.actuator, Drive):
+    # of the current do not give the energies. A geared motor integrates them within each step.
+    if isinstance(trace.actuator, Geared):
         heat = trace.signals["copper_loss"] * trace.timestep
         # The formula for one temperature also holds for an array of them.
         temperature: Any = trace.signals["temperature"]

@@ -44,6 +44,10 @@ from codrl_mj.sizing.loop import simulate_loop as simulate_loop
 from codrl_mj.sizing.loop import small_step_response as small_step_response
 from codrl_mj.sizing.loop import step_responses as step_responses
 from codrl_mj.sizing.loop import undersampling_warning as undersampling_warning
+from codrl_mj.sizing.servo_response import ServoResponse as ServoResponse
+from codrl_mj.sizing.servo_response import ServoTrace as ServoTrace
+from codrl_mj.sizing.servo_response import analyze_servo as analyze_servo
+from codrl_mj.sizing.servo_response import find_servo as find_servo
 from codrl_mj.sizing.swing import Swing as Swing
 from codrl_mj.sizing.swing import min_energy_gain as min_energy_gain
 from codrl_mj.sizing.swing import min_pumped_energy as min_pumped_energy

@@ -20,6 +20,8 @@ from codrl_mj.actuators import (
     ActuatorSetting,
     Drive,
     GearMotor,
+    PwmLoop,
+    PwmServo,
     Servo,
     ServoLoop,
     override_actuator,
@@ -51,7 +53,7 @@ def find_drive(
 ) -> Drive:
     """Return a drive by name, with overridden fields; None keeps a field.
 
-    A servo is returned without its outer loops.
+    A servo is returned without its outer loops, also one that has no current loop.
 
     Args:
         name: anything that `codrl_mj.actuators.resolve` accepts, such as a catalogue motor.
@@ -78,7 +80,7 @@ def find_drive(
         "supply": {"voltage": voltage},
     }
     base: ActuatorModel = resolve(name, None, "a motor on its own")
-    if isinstance(base, Servo):
+    if isinstance(base, Servo | PwmServo):
         base = override_actuator(base, {"family": Drive.family})
     if type(base) is not Drive:
         raise ValueError(
@@ -317,10 +319,10 @@ def catalogue_rows(sort: str = "name") -> list[CatalogueRow]:
     return sorted(rows, key=lambda row: (row[sort] is None, -(row[sort] or 0.0)))
 
 
-def find_loop(name: ActuatorSetting) -> ServoLoop | None:
+def find_loop(name: ActuatorSetting) -> ServoLoop | PwmLoop | None:
     """Return the outer loops of the servo with a name of `find_drive`; None for other actuators."""
     base: ActuatorModel = resolve(name, None, "a motor on its own")
-    return base.loop if isinstance(base, Servo) else None
+    return base.loop if isinstance(base, Servo | PwmServo) else None
 
 
 class Quantity(TypedDict):
@@ -362,7 +364,9 @@ class MotorReport(TypedDict):
 
 
 def describe_motor(
-    drive: Drive, entry: MotorEntry | None = None, loop: ServoLoop | None = None
+    drive: Drive,
+    entry: MotorEntry | None = None,
+    loop: ServoLoop | PwmLoop | None = None,
 ) -> MotorReport:
     """Return all known data of a motor as JSON-serializable values, of which some may be infinite.
 
@@ -373,10 +377,11 @@ def describe_motor(
     """
     parts = {
         "motor": drive.motor,
-        "controller": drive.controller,
+        "controller": None if isinstance(loop, PwmLoop) else drive.controller,
         "supply": drive.supply,
         "loop": loop,
     }
+    simulated = PwmServo(drive.motor, loop, drive.supply) if isinstance(loop, PwmLoop) else drive
     report: MotorReport = {
         "drive": [
             _value(
@@ -385,12 +390,13 @@ def describe_motor(
             for part, owner in parts.items()
             if owner is not None
             for field in dataclasses.fields(owner)
+            if not (isinstance(owner, PwmLoop) and field.name in ("position_p", "stiffness"))
         ],
         "abilities": [
             _value(name, value, LIMIT_UNITS[name])
             for name, value in drive_limits(drive)._asdict().items()
         ],
-        "assumed": drive.assumed,
+        "assumed": simulated.assumed,
     }
     if entry is None:
         return report

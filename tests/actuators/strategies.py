@@ -12,6 +12,8 @@ from codrl_mj.actuators import (
     GearMotor,
     Lag,
     Motor,
+    PwmLoop,
+    PwmServo,
     SampledLoop,
     Supply,
     TorqueSpeed,
@@ -100,9 +102,29 @@ drives = st.builds(
     st.none() | st.builds(Supply, between(1, 60), zero_or(1e-3, 0.1)),
 )
 """Motors in the range of commercial ones."""
+pwm_servos = st.builds(
+    PwmServo,
+    gear_motors,
+    st.builds(
+        PwmLoop,
+        position_gain=between(0.1, 50),
+        integral_gain=zero_or(0.01, 20),
+        derivative_gain=zero_or(1e-3, 0.1),
+        servo_rate=st.sampled_from([100.0, 1000.0, 700.0]),
+        max_duty=between(0.3, 1),
+        start_duty=zero_or(1e-3, 0.2),
+        encoder_counts=st.sampled_from([0.0, 4096.0]),
+        command_rate=st.sampled_from([30.0, 50.0, 1000.0]),
+        command_delay=zero_or(1e-3, 0.1),
+        command_jitter=zero_or(1e-4, 0.01),
+    ),
+    st.none() | st.builds(Supply, between(1, 60), zero_or(1e-3, 0.1)),
+)
+"""Servos without a current loop, on a bus."""
 of_every_family = st.one_of(
     every_actuator,
     drives,
+    pwm_servos,
     st.just(IDEAL),
     st.builds(Lag, time_constant=zero_or(1e-3, 5), delay=zero_or(1e-3, 5)),
     st.builds(

@@ -17,6 +17,7 @@ from codrl_mj.actuators import (
     Ideal,
     Inputs,
     Lag,
+    PwmServo,
     Servo,
     TorqueSpeed,
     VoltageDrive,
@@ -237,6 +238,54 @@ def servo_case(draw):
     return timestep, p, state, inputs, units | {"error": 300.0 / ratio}
 
 
+def pwm_servo_case(draw):
+    n, timestep = draw.n, 0.002
+    _, p, state, inputs, units = drive_case(draw, Drive)
+    p = {name: p[name] for name in parameters_type(PwmServo)._fields if name in p}
+    state = {name: state[name] for name in PwmServo.State._fields if name in state}
+    ratio = p["gear_ratio"]
+    position = inputs["position"] / ratio
+    command = position + draw.normal(0.3)
+    p = defaults(PwmServo, n) | p
+    p |= {
+        "position_gain": draw.log(0.5, 20),
+        "integral_gain": draw.sometimes(0.5, draw.log(0.5, 20)),
+        "derivative_gain": draw.sometimes(0.5, draw.log(0.001, 0.1)),
+        "servo_rate": draw.choice(100.0, 250.0, 500.0, 1000.0, 2000.0),
+        "max_duty": draw.sometimes(0.5, draw.uniform(0.5, 1.0), 1.0),
+        "start_duty": draw.sometimes(0.3, draw.uniform(0.01, 0.1)),
+        "deadband": draw.sometimes(0.3, draw.log(0.001, 0.3)),
+        "encoder_counts": draw.sometimes(0.3, 4096.0),
+        "max_velocity": draw.sometimes(0.5, draw.log(0.5, 20), INF),
+        "max_acceleration": draw.sometimes(0.5, draw.log(5, 500), INF),
+        "command_rate": draw.choice(50.0, 60.0, 1000.0),
+        "command_delay": draw.sometimes(0.5, draw.uniform(0.0, 0.01)),
+        "command_jitter": draw.sometimes(0.5, 0.0009),
+    }
+    inputs["desired_torque"] = command * ratio
+    interval = np.maximum(1.0 / p["command_rate"], timestep)
+    sent = np.floor(inputs["time"] / interval + 1e-6)
+    state |= {
+        "target": position + draw.normal(0.2),
+        "target_velocity": draw.normal(2.0),
+        "error": draw.normal(0.2),
+        "integral": draw.uniform(-0.5, 0.5),
+        "duty": draw.uniform(-1, 1),
+        "steps_to_sample": draw.rng.integers(0, 3, n).astype(float),
+        "sent": sent + draw.choice(0.0, 1.0),
+        **{f"c{k}": command + draw.normal(0.2) for k in range(1, 9)},
+    }
+    # Positions are up to 300 rad, and the gain of the error's rate multiplies their rounding.
+    duty = 300.0 * (p["position_gain"] + p["derivative_gain"] * p["servo_rate"])
+    scale = {name: units[name] for name in units if name in (*state, *PwmServo.Signals._fields)}
+    scale |= dict.fromkeys(("duty", "integral"), duty) | {"torque": units["torque"] * duty}
+    scale |= {name: units[name] * duty for name in ("current", "voltage", "acceleration")}
+    scale |= {name: units[name] * duty**2 for name in ("electrical_power", "copper_loss")}
+    scale |= dict.fromkeys(("error", "target", *(f"c{k}" for k in range(1, 9))), 300.0 / ratio)
+    scale |= {"target_velocity": 300.0 * p["servo_rate"]}
+    return timestep, p, state, inputs, scale
+
+
 def current_loop_case(draw, family=DCMotorActuator):
     n, timestep = draw.n, 0.02
     p = defaults(family, n) | {
@@ -297,6 +346,7 @@ FAMILIES = {
     "drive": (Drive, drive_case),
     "voltage_drive": (VoltageDrive, lambda draw: drive_case(draw, VoltageDrive)),
     "servo": (Servo, servo_case),
+    "pwm_servo": (PwmServo, pwm_servo_case),
     "lag": (Lag, lag_case),
     "torque_speed": (TorqueSpeed, torque_speed_case),
     "ideal": (Ideal, lambda draw: (0.002, {}, {}, inputs_of(draw, 0.002), {})),

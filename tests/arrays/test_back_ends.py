@@ -27,7 +27,7 @@ def test_every_built_in_family_has_cases():
     assert {family for family, _ in FAMILIES.values()} >= set(BUILT_IN)
 
 
-@pytest.mark.parametrize("name", ["drive", "servo", "current_loop", "torque_speed"])
+@pytest.mark.parametrize("name", ["drive", "servo", "pwm_servo", "current_loop", "torque_speed"])
 def test_cases_are_saturated_and_unsaturated(name):
     actuators = case(name, 200)
     flags = [k for k, field in enumerate(actuators.family.Signals._fields) if "saturated" in field]

@@ -23,7 +23,9 @@ def torque_errors(actuators, results):
     return relative[:, actuators.state.shape[1]]
 
 
-@pytest.mark.parametrize("name", ["current_loop", "drive", "servo", "lag", "torque_speed"])
+@pytest.mark.parametrize(
+    "name", ["current_loop", "drive", "servo", "pwm_servo", "lag", "torque_speed"]
+)
 def test_numpy_in_float32_is_close_to_python(name):
     actuators = rounded(case(name, 200))
     results = run_arrays(actuators, np, to_float32)

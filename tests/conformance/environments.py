@@ -278,6 +278,8 @@ def task_environments():
         elif physics == "analytic":
             labels = ("single", "SameStep")
         yield from interfaces(f"{task}-{physics}-{setup}", task, options, quick, labels)
+    quick = ("single", "SameStep", "sb3", "dm_env")
+    yield from interfaces("pendulum-bus_servo", "pendulum", BUS_SERVO, quick)
 
 
 def limited_cheetah(**options):
@@ -290,6 +292,17 @@ THIRD = {"is_task": False, "copies": "reset"}
 TWO_KINDS = {"actuator": {"b.*": MAXON[".*"], "f.*": "lag"}, "observe_actuator": True}
 LAG = {"actuator": {".*": "lag"}}
 DRAWN_LAG = LAG | {"randomize": {"time_constant": "loguniform(0.01, 1)"}}
+BUS_SERVO = {
+    "actuator": {
+        "name": "feetech-sts3215-7v4",
+        "family": "pwm_servo",
+        "loop": {"command_rate": 60.0, "command_jitter": 0.002, "max_velocity": 4.0},
+    },
+    "action": "position",
+    "randomize": {"loop.command_delay": "uniform(0, 0.03)", "motor.resistance": "uniform(2, 4)"},
+    "observe_actuator": True,
+}
+"""Arguments with a servo on a bus, whose delay is drawn at each reset."""
 DRAWN_RIG = {
     "actuator": {"drive": "maxon-re65"},
     "randomize": {"motor.resistance": "uniform(0.1, 0.2)", "model.gravity": "uniform(0.9, 1.1)"},
@@ -318,6 +331,13 @@ def third_party_environments():
             {"motors": 6},
         ),
         ("function-drawn", FUNCTION, DRAWN_LAG, ("single", "dm_env"), {"motors": 6}),
+        (
+            "cheetah-bus_servo",
+            CHEETAH,
+            BUS_SERVO | {"actuator": {".*": BUS_SERVO["actuator"]}},
+            ("single",),
+            {"motors": 6},
+        ),
     ):
         original = functools.partial(gymnasium.make, CHEETAH)
         yield from interfaces(name, env, options, quick, original=original, **THIRD, **supports)

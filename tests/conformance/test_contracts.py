@@ -171,7 +171,8 @@ def test_observations_are_in_the_space_and_end_with_the_sensors(environment):
         if environment.is_observed and is_single(environment):
             # A family without current has no sensors; its signals are NaN.
             count = len(env.bank.sensors)
-            values = np.stack([np.ravel(info["current"]), np.ravel(info["reference_current"])])
+            second = "duty" if "duty" in info else "reference_current"
+            values = np.stack([np.ravel(info["current"]), np.ravel(info[second])])
             expected = values.T[~np.isnan(values[0])]
             pairs = observation_of(outcome)[-count:].reshape(-1, 2)
             np.testing.assert_allclose(pairs[:, 1], expected[:, 1], rtol=1e-6, atol=1e-6)

@@ -15,6 +15,8 @@ from codrl_mj.actuators import (
     GearMotor,
     Inputs,
     Lag,
+    PwmLoop,
+    PwmServo,
     SampledLoop,
     Servo,
     ServoLoop,
@@ -185,6 +187,29 @@ ALL = [
     Servo(
         loop=ServoLoop(
             "velocity", 50.0, velocity_integral_gain=2.0, inertia_feed_forward=0.01, max_torque=0.3
+        )
+    ),
+    PwmServo(
+        GearMotor(torque_constant=0.5, gear_ratio=2.0, gear_efficiency=0.8),
+        PwmLoop(
+            position_gain=2.0,
+            integral_gain=1.0,
+            servo_rate=500.0,
+            max_duty=0.5,
+            encoder_counts=4096.0,
+            max_velocity=3.0,
+            max_acceleration=30.0,
+        ),
+        Supply(2.0, 0.2),
+    ),
+    PwmServo(
+        loop=PwmLoop(
+            derivative_gain=0.01,
+            deadband=0.01,
+            start_duty=0.05,
+            command_rate=50.0,
+            command_delay=0.03,
+            command_jitter=0.004,
         )
     ),
     FULL,

@@ -12,8 +12,10 @@ from codrl_mj.actuators import (
     ActuatorModel,
     DCMotorActuator,
     Drive,
+    Geared,
     Ideal,
     Inputs,
+    PwmServo,
     Supply,
     TorqueSpeed,
     parameters_type,
@@ -189,7 +191,7 @@ def episode_diagram(lines: Sequence[MotorSeries]) -> Plot | None:
     if not motor_lines:
         return None
     for line in motor_lines:
-        ratio = line.actuator.motor.gear_ratio if isinstance(line.actuator, Drive) else 1.0
+        ratio = line.actuator.motor.gear_ratio if isinstance(line.actuator, Geared) else 1.0
         speed, torque = line.turning / ratio, line.actual * ratio
         no_load = no_load_speed(line.actuator)
         width = max(
@@ -234,6 +236,8 @@ def torque_range(
     None means that there are no such limits. The friction of the joint is part of the model and is
     not subtracted.
     """
+    if isinstance(actuator, PwmServo):
+        actuator = Drive(actuator.motor, supply=actuator.supply)
     if isinstance(actuator, Drive):
         no_friction = {
             f"motor.{name}": 0.0
@@ -277,7 +281,7 @@ def no_load_speed(actuator: ActuatorModel) -> float:
     """Return the speed without torque, before friction [rad/s]; infinite if it is unknown."""
     if isinstance(actuator, TorqueSpeed):
         return float(actuator.no_load_speed)
-    if isinstance(actuator, Drive | DCMotorActuator) and actuator.voltage_limit is not None:
+    if isinstance(actuator, Geared | DCMotorActuator) and actuator.voltage_limit is not None:
         constant = actuator.motor.back_emf_constant * getattr(actuator.motor, "gear_ratio", 1.0)
         return float(actuator.voltage_limit / constant) if constant > 0.0 else math.inf
     return math.inf

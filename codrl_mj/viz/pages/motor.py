@@ -6,7 +6,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from codrl_mj.actuators import Drive
+from codrl_mj.actuators import Drive, PwmServo
 from codrl_mj.catalogue import MotorEntry
 from codrl_mj.sizing import (
     LoopAnalysis,
@@ -17,6 +17,7 @@ from codrl_mj.sizing import (
     step_responses,
 )
 from codrl_mj.sizing.limits import MotorReport, Quantity
+from codrl_mj.sizing.servo_response import PositionServo, ServoResponse
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.diagrams import (
     Loops,
@@ -25,6 +26,7 @@ from codrl_mj.viz.pages.diagrams import (
     small_step_plots,
     torque_speed_diagram,
 )
+from codrl_mj.viz.pages.servo_diagrams import servo_plots
 
 _LOOP_ROWS = (
     ("sample_rate", "sample rate", "Hz"),
@@ -97,15 +99,28 @@ def _display_value(loop_design: LoopAnalysis, field: str) -> float:
     return 20.0 * math.log10(value) if field == "gain_margin" else value * _SCALES.get(field, 1.0)
 
 
-def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> Path:
+def motor_page(
+    name: str,
+    drive: Drive,
+    entry: MotorEntry | None,
+    out: Path,
+    servo: PositionServo | None = None,
+    response: ServoResponse | None = None,
+) -> Path:
     """Write the page of a motor with its drive, and its datasheet if it has one.
+
+    A servo has its responses on the page; one without a current loop has no section on that.
 
     Return the file.
     """
-    explanation = describe_motor(drive, entry)
-    sections = [
-        page.Section("abilities", "Limits", _abilities(explanation, drive, entry)),
-        page.Section("loop", "Current loop", _loop(name, drive)),
+    explanation = describe_motor(drive, entry, None if servo is None else servo.loop)
+    sections = [page.Section("abilities", "Limits", _abilities(explanation, drive, entry))]
+    if servo is not None and response is not None:
+        plots = page.plots(servo_plots(servo, response))
+        sections.append(page.Section("servo", "Servo", plots))
+    if not isinstance(servo, PwmServo):
+        sections.append(page.Section("loop", "Current loop", _loop(name, drive)))
+    sections += [
         page.Section("numbers", "The motor, at its rotor", _numbers(explanation)),
         page.Section(
             "drive", "As it is simulated", _values("Fields of the drive", explanation["drive"])
