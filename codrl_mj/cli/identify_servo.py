@@ -6,7 +6,13 @@ from typing import Literal
 
 import tyro
 
-from codrl_mj.cli.identify import Columns, Logs, print_findings, print_identification
+from codrl_mj.cli.identify import (
+    Columns,
+    Logs,
+    print_findings,
+    print_identification,
+    write_page,
+)
 from codrl_mj.cli.parsing import AsJson, Output, parse_named_numbers
 from codrl_mj.cli.terminal import progress_bar
 from codrl_mj.identify.log import Log

@@ -58,6 +58,8 @@ _EXPLAINED = 1.0
 """Mean residual, in standard deviations of the sensor, up to which a fit explains the logs."""
 _LIMITED = 0.002
 """Share of the rows in which the torque must exceed its limit, so that the limit is told."""
+_MAX_LIMITED_COST = 0.6
+"""Largest cost of a fit with a limit of the torque, over that without, at which it is accepted."""
 _DELAY_ROWS = 3.0
 """Delay in rows below which an error of the delay is judged by this delay."""
 NUM_STEPS = 12
@@ -273,9 +275,12 @@ def _fit(
         fit, start_fits = (fit, start_fits) if limited is None else (limited, (limited,))
     if "stall_torque" in fit.model.names:
         stall = fit.values[fit.model.names.index("stall_torque")]
-        if largest_torque(fit.model, fit.values, segments, 1.0 - _LIMITED) < stall:
-            fit = _without_limit(fit)
-            start_fits = (fit,)
+        is_reached = largest_torque(fit.model, fit.values, segments, 1.0 - _LIMITED) > stall
+        unlimited = _without_limit(fit)
+        # Friction that the model lacks looks like a limit, but explains little of the residuals.
+        costs = [float(one.costs(fit.scale).sum()) for one in (fit, unlimited)]
+        if not (is_reached and costs[0] < _MAX_LIMITED_COST * costs[1]):
+            fit, start_fits = unlimited, (unlimited,)
     return choice, dataclasses.replace(fit, logs=tuple(logs), start_fits=start_fits)
 
 

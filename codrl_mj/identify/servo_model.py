@@ -43,7 +43,7 @@ _WINDOW = 0.02
 """Duration [s] that positions are smoothed over for an initial guess."""
 _SPREADS = (1.0, 0.6, 0.3, 0.15)
 """Standard deviations of the random search by round, in logarithms or in scales."""
-_VARIATIONS = 80
+_VARIATIONS = 60
 """Variations in a round of the random search."""
 _CREEPING = 0.05
 """Speed, over the RMS of the speeds, below which friction may hold the shaft."""

@@ -109,7 +109,7 @@ class IdentifiedServo(Identified):
             raise ValueError(problem)
         values = {estimate.name: estimate.value for estimate in self.estimates}
         delay = max(values["command_delay"], 0.0)
-        rate = 1.0 / self.step
+        rate = float(f"{1.0 / self.step:.6g}")
         if delay > 0.0:
             rate = min(rate, math.floor(_MAX_WAITING / delay))
         loop = {

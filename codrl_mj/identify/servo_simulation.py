@@ -11,8 +11,12 @@ import numpy as np
 
 from codrl_mj.compile_cache import njit
 from codrl_mj.identify.parameters import ShaftParameters
-from codrl_mj.identify.simulation import MAX_SUBSTEP, step_shaft
+from codrl_mj.identify.simulation import step_shaft
 
+MAX_SUBSTEP = 2.5e-3
+"""Longest substep [s]."""
+MAX_PHASE = 0.1
+"""Largest substep in radians of the servo's oscillation with its load."""
 MIN_SUBSTEP = 1e-9
 """Duration [s] below which a substep is left out."""
 
@@ -73,6 +77,9 @@ def simulate_position_servo(
     row, last, delay = 0, len(log_times) - 1, servo.command_delay
     while row < last and log_times[row + 1] + delay <= times[0]:
         row += 1
+    # Leapfrog steps of a phase of 0.1 err by 0.04 % in frequency.
+    frequency = math.sqrt(servo.position_gain / parameters.inertia)
+    max_substep = min(MAX_SUBSTEP, MAX_PHASE / frequency)
     for index in range(len(times) - 1):
         time, end = times[index], times[index + 1]
         gain = servo.position_gain * volts[index] * gains[index]
@@ -84,7 +91,7 @@ def simulate_position_servo(
                 row += 1
             arrival = log_times[row + 1] + delay if row < last else end
             until = min(end, arrival)
-            step = (until - time) / max(math.ceil((until - time) / MAX_SUBSTEP - 1e-6), 1)
+            step = (until - time) / max(math.ceil((until - time) / max_substep - 1e-6), 1)
             # The error in the middle of a substep makes the step accurate to second order.
             torque = gain * (targets[row] - servo.zero - position - 0.5 * step * speed)
             if servo.limits_torque == 0.0:
