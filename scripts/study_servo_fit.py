@@ -46,12 +46,12 @@ def fit_draw(kind, seed):
     return rows
 
 
-def study_draws(path, draws, kinds):
-    """Fit all draws that are not in a file yet, and append their rows."""
+def study_draws(path, seeds, kinds):
+    """Fit the servos of seeds that are not in a file yet, and append their rows."""
     done = {(row[0], int(row[1])) for row in read_rows(path)}
     with path.open("a", newline="") as file:
         writer = csv.writer(file)
-        for seed in range(draws):
+        for seed in seeds:
             for kind in kinds:
                 if (kind, seed) not in done:
                     writer.writerows(fit_draw(kind, seed))
@@ -177,6 +177,7 @@ def main():
     )
     parser.add_argument("study", choices=("draws", "xl330"))
     parser.add_argument("--draws", type=int, default=100, help="random servos of each kind")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first servo")
     parser.add_argument("--kinds", nargs="+", default=servo_simulators.KINDS)
     parser.add_argument("--out", type=Path, default=Path("servo_draws.csv"), help="rows")
     parser.add_argument("--only-page", action="store_true", help="write the summary, fit nothing")
@@ -187,7 +188,8 @@ def main():
         study_xl330(options.logs, options.parameters)
         return 0
     if not options.only_page:
-        study_draws(options.out, options.draws, options.kinds)
+        seeds = range(options.first, options.first + options.draws)
+        study_draws(options.out, seeds, options.kinds)
     rows = read_rows(options.out)
     if options.only_page:
         write_summary(rows)

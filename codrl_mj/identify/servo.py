@@ -11,7 +11,7 @@ import numpy as np
 from codrl_mj.fields import check_names
 from codrl_mj.identify.duty_law import DutyLaw, fit_duty_law
 from codrl_mj.identify.estimate import MAX_COST_RATIO, Fit, fit_from_starts, optimize
-from codrl_mj.identify.friction import FrictionChoice, choose_friction
+from codrl_mj.identify.friction import choose_friction
 from codrl_mj.identify.identify import separate_logs
 from codrl_mj.identify.log import MAX_STEP, MIN_ROWS, Log, gapless_stretches, has_motion
 from codrl_mj.identify.parameters import FRICTION, MIN_SIZES, PARAMETERS, PER_INERTIA
@@ -54,8 +54,6 @@ _LOOP_PERIOD = 1e-3
 """Time [s] by which the firmware's loop may be late, besides the command."""
 _MIN_SHARE = 0.005
 """Smallest relative half-width, because no load is weighed and measured more exactly."""
-_EXPLAINED = 1.0
-"""Mean residual, in standard deviations of the sensor, up to which a fit explains the logs."""
 _LIMITED = 0.002
 """Share of the rows in which the torque must exceed its limit, so that the limit is told."""
 _MAX_LIMITED_COST = 0.6
@@ -127,12 +125,12 @@ def identify_servo(
         supply_voltage=arguments.supply_voltage,
         gain=arguments.gain,
     )
-    choice, fit = _fit(model, logs, friction, step("servo"))
+    fit, friction_reason, other_stall = _fit(model, logs, friction, step("servo"))
     estimates, warnings, unexplained = assess_fits(
         {"shaft": fit}, arguments.known, fit.model.defaults, seed, step
     )
     law = fit_duty_law(fit) if all(log.has("duty") for log in logs) else None
-    estimates = _finish(estimates, fit, arguments, law)
+    estimates = _finish(estimates, fit, arguments, law, other_stall)
     bus = arguments.supply_voltage
     return IdentifiedServo(
         logs=tuple(log.name for log in logs),
@@ -148,7 +146,7 @@ def identify_servo(
         correlations={"winding": {}, "shaft": correlations(fit)},
         supply=None if math.isnan(bus) else bus,
         unexplained=unexplained,
-        friction_reason=choice.reason,
+        friction_reason=friction_reason,
         step=float(np.median([log.step for log in logs])),
         is_scaled=arguments.is_scaled,
         gain=None if math.isnan(arguments.gain) else arguments.gain,
@@ -262,32 +260,50 @@ def _common(logs: Sequence[Log], name: str) -> np.ndarray | None:
     return values
 
 
+class _Servo(NamedTuple):
+    """A fitted servo."""
+
+    fit: Fit[ServoModel]
+    friction_reason: str
+    # Stall torque [N*m] by the other law of its limit, if it explains the logs as well; else not a
+    # number.
+    other_stall: float
+
+
 def _fit(
     model: ServoModel, logs: Sequence[Log], friction: str, on_step: Callable[[], None]
-) -> tuple[FrictionChoice[ServoModel], Fit[ServoModel]]:
-    """Return the friction model and the fit, without a limit of the torque that is not reached."""
+) -> _Servo:
+    """Fit a servo with the friction and the limit of the torque that explain the logs.
+
+    The limit applies to the duty, before the damping by the back-EMF, or to the torque after it. A
+    limit that is not reached is left out.
+    """
     choice = choose_friction(model, logs, friction, on_step)
     segments = choice.model.segments(logs)
     guessed, starts = choice.model.initial_guess(segments)
     fit, start_fits = fit_from_starts(guessed, segments, starts, on_step)
-    if np.mean(np.abs(np.concatenate(fit.residuals))) > _EXPLAINED:
-        limited = _with_limited_torque(fit)
-        fit, start_fits = (fit, start_fits) if limited is None else (limited, (limited,))
+    other_stall = math.nan
     if "stall_torque" in fit.model.names:
-        stall = fit.values[fit.model.names.index("stall_torque")]
-        is_reached = largest_torque(fit.model, fit.values, segments, 1.0 - _LIMITED) > stall
+        other = _with_limited_torque(fit)
+        costs = [float(one.costs(fit.scale).sum()) for one in (fit, other)]
+        # The law with one more parameter has to be clearly better.
+        if costs[1] < MAX_COST_RATIO * costs[0]:
+            fit, start_fits = other, (other,)
+        elif costs[0] > MAX_COST_RATIO * costs[1]:
+            other_stall = other.model.all_values(other.values)["stall_torque"]
         unlimited = _without_limit(fit)
         # Friction that the model lacks looks like a limit, but explains little of the residuals.
         costs = [float(one.costs(fit.scale).sum()) for one in (fit, unlimited)]
+        stall = fit.values[fit.model.names.index("stall_torque")]
+        is_reached = largest_torque(fit.model, fit.values, segments, 1.0 - _LIMITED) > stall
         if not (is_reached and costs[0] < _MAX_LIMITED_COST * costs[1]):
-            fit, start_fits = unlimited, (unlimited,)
-    return choice, dataclasses.replace(fit, logs=tuple(logs), start_fits=start_fits)
+            fit, start_fits, other_stall = unlimited, (unlimited,), math.nan
+    fit = dataclasses.replace(fit, logs=tuple(logs), start_fits=start_fits)
+    return _Servo(fit, choice.reason, other_stall)
 
 
-def _with_limited_torque(fit: Fit[ServoModel]) -> Fit[ServoModel] | None:
-    """Return the fit of a servo whose limit applies after the damping, if it is clearly better."""
-    if "stall_torque" not in fit.model.names:
-        return None
+def _with_limited_torque(fit: Fit[ServoModel]) -> Fit[ServoModel]:
+    """Return the fit of a servo whose limit applies after the damping."""
     names, damping = fit.model.names, fit.model.all_values(fit.values)["damping"]
     model = dataclasses.replace(
         fit.model,
@@ -295,15 +311,14 @@ def _with_limited_torque(fit: Fit[ServoModel]) -> Fit[ServoModel] | None:
         names=(*names, "viscous_friction"),
         scales=np.append(fit.model.scales, max(damping, 1e-9)),
     )
-    starts = []
     largest = largest_torque(model, np.append(fit.values, 0.0), fit.segments, 1.0)
+    fits = []
     for share in (0.3, 0.5, 0.8):
         start = np.append(fit.values, 0.1 * damping)
         start[names.index("stall_torque")] = share * largest
-        starts.append(start)
-    other, _ = fit_from_starts(model, fit.segments, starts)
-    scale = min(fit.scale, other.scale)
-    return other if other.costs(scale).sum() < MAX_COST_RATIO * fit.costs(scale).sum() else None
+        fits.append(optimize(model, fit.segments, start, 8, fit.scale))
+    best = min(fits, key=lambda one: one.costs(fit.scale).sum())
+    return optimize(model, fit.segments, best.values, 40, fit.scale, best.states)
 
 
 def _without_limit(fit: Fit[ServoModel]) -> Fit[ServoModel]:
@@ -332,6 +347,7 @@ def _finish(
     fit: Fit[ServoModel],
     arguments: _Arguments,
     law: DutyLaw | None,
+    other_stall: float,
 ) -> list[Estimate]:
     """Widen intervals by what a fit cannot see, and add what follows from the parameters."""
     by_name = {estimate.name: estimate for estimate in estimates if estimate.name in _NAMES}
@@ -353,6 +369,8 @@ def _finish(
             elif name == "stall_torque" and not fit.model.limits_torque:
                 extra *= estimate.value / max(by_name["damping"].value, extra)
             estimate = _widened(estimate, extra, "loop", by_name)
+        if name == "stall_torque" and not math.isnan(other_stall):
+            estimate = _with_other_law(estimate, other_stall, by_name)
         if name == "command_delay":
             estimate = _widened(estimate, _ROW_SHARE * row, "row", by_name, row)
         else:
@@ -364,6 +382,18 @@ def _finish(
     if not arguments.is_scaled:
         by_name = _per_inertia(by_name)
     return [by_name[name] for name in PARAMETERS if name in by_name]
+
+
+def _with_other_law(
+    estimate: Estimate, other: float, by_name: Mapping[str, Estimate]
+) -> Estimate:
+    """Return a stall torque that covers the value by the other law, if that lies outside."""
+    if estimate.low <= other <= estimate.high:
+        return estimate
+    widened = _widened(estimate, 1.25 * abs(other - estimate.value), "limit", by_name)
+    if widened.status == "identified":
+        return dataclasses.replace(widened, status="rough", why=CAUSES["limit"])
+    return widened
 
 
 def _rms_speed(fit: Fit[ServoModel]) -> float:
@@ -424,7 +454,7 @@ def _ratio(name: str, numerator: Estimate, denominator: Estimate, factor: float 
         )
     )
     worst = max((numerator, denominator), key=lambda estimate: _RANK[estimate.status])
-    status: Status = "identified" if worst.status in ("given", "rough") else worst.status
+    status: Status = "identified" if worst.status == "given" else worst.status
     why = "" if status == "identified" else f"{worst.name} is {worst.status}: {worst.why}"
     estimate = Estimate(name, value, value * (1.0 - share), value * (1.0 + share), status, why)
     return _judged(estimate, share, "the values that it follows from are not known better")

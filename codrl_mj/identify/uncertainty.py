@@ -69,6 +69,7 @@ CAUSES = {
     "self_test": "a fit to its own simulation gives another value",
     "unexplained": "the model does not explain the current",
     "torque_constant": "the constant of the winding that it depends on is not known better",
+    "limit": "the logs do not tell if the duty is limited, or the torque",
     "loop": "the period of the firmware's loop is unknown",
     "load": "loads are not known more exactly",
     "row": "a row does not show when within it a command is sent",
