@@ -71,7 +71,10 @@ class Servo:
 def draw(seed, kind="bam"):
     """Return a random servo: a motor of 0.3 to 4 N*m with a pendulum of a fifth to a half of it."""
     random = np.random.default_rng((seed, KINDS.index(kind)))
-    stall, volts = math.exp(random.uniform(math.log(0.5), math.log(4.0))), random.choice([7.4, 12.0])
+    stall, volts = (
+        math.exp(random.uniform(math.log(0.5), math.log(4.0))),
+        random.choice([7.4, 12.0]),
+    )
     no_load_speed = random.uniform(4.0, 12.0)
     constant = volts / no_load_speed
     mgl, length = stall * random.uniform(0.2, 0.45), random.uniform(0.08, 0.2)
@@ -93,7 +96,7 @@ def draw(seed, kind="bam"):
 
 
 def commands(times, seed=0):
-    """Return commands [rad]: a sweep, steps, and slow and fast sines, for a third of the time each."""
+    """Return commands [rad]: a sweep, steps and sines, for a third of the time each."""
     random = np.random.default_rng((seed, 99))
     third = times[-1] / 3.0
     local = times % third
@@ -146,7 +149,7 @@ def simulate_pwm(servo, targets, period=2e-3, bits=10):
     inertia = servo.load_inertia + servo.armature
     slope = servo.torque_constant**2 / servo.resistance + servo.viscous
     positions, duties = np.empty(len(targets)), np.empty(len(targets))
-    every, fine, levels = round(period / STEP), STEP / 2.0, 2.0**bits
+    every, substep, levels = round(period / STEP), STEP / 2.0, 2.0**bits
     for row, target in enumerate(targets):
         positions[row] = position
         if row % every == 0:
@@ -159,12 +162,12 @@ def simulate_pwm(servo, targets, period=2e-3, bits=10):
             torque -= servo.mgl * math.sin(position - servo.zero)
             if speed == 0.0:
                 torque -= math.copysign(min(servo.coulomb, abs(torque)), torque)
-                speed = torque / inertia * fine
+                speed = torque / inertia * substep
             else:
                 before = speed
-                speed += (torque - math.copysign(servo.coulomb, speed)) / inertia * fine
+                speed += (torque - math.copysign(servo.coulomb, speed)) / inertia * substep
                 speed = 0.0 if speed * before < 0.0 else speed
-            position += speed * fine
+            position += speed * substep
     return positions, duties
 
 

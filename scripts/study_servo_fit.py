@@ -26,7 +26,9 @@ FRICTION = {"bam_m3": "load"}
 UNTOLD = {"mujoco_position": ("duty_gain",), "bam_m3": ("coulomb_friction",)}
 """Kind of simulation -> parameters that it does not have in our sense."""
 GAINS = (100, 200, 800)
-COLUMNS = "time=timestamp:s,position=position:rad,command=goal_position:rad,gain=kp:1,only=torque_enable"
+COLUMNS = (
+    "time=timestamp:s,position=position:rad,command=goal_position:rad,gain=kp:1,only=torque_enable"
+)
 ERROR_GAIN, VOLTS, STEP = 0.00246, 7.4, 0.005
 """Duty per angle error and register, supply [V] and time step [s] of BAM's XL330."""
 
@@ -42,18 +44,19 @@ def fit_draw(kind, seed):
         if truth is None or estimate.status == "given" or estimate.name in UNTOLD.get(kind, ()):
             continue
         values = (truth, estimate.value, estimate.low, estimate.high)
-        rows.append((kind, seed, estimate.name, *(f"{value:.6g}" for value in values), estimate.status))
+        texts = (f"{value:.6g}" for value in values)
+        rows.append((kind, seed, estimate.name, *texts, estimate.status))
     return rows
 
 
 def study_draws(path, seeds, kinds):
     """Fit the servos of seeds that are not in a file yet, and append their rows."""
-    done = {(row[0], int(row[1])) for row in read_rows(path)}
+    fitted = {(row[0], int(row[1])) for row in read_rows(path)}
     with path.open("a", newline="") as file:
         writer = csv.writer(file)
         for seed in seeds:
             for kind in kinds:
-                if (kind, seed) not in done:
+                if (kind, seed) not in fitted:
                     writer.writerows(fit_draw(kind, seed))
                     file.flush()
 
@@ -67,7 +70,7 @@ def read_rows(path):
 
 
 def summarize(rows):
-    """Return for each kind and parameter: draws, identified, right among them, median half-width."""
+    """Return kind, parameter, logs, identified, right among these, and median half-width."""
     groups = {}
     for kind, _, name, *numbers, status in rows:
         groups.setdefault((kind, name), []).append((*map(float, numbers), status))
@@ -147,7 +150,7 @@ def study_xl330(folder, parameters):
     """Print the errors on the held-out logs of each gain, for our fits and for BAM's parameters."""
     logs = {path: read_log(path, COLUMNS) for path in sorted(folder.glob("*.json"))}
     known, errors = {"mass": 0.49, "length": 0.1}, {}
-    for friction in ("coulomb", "load", "both"):
+    for friction in ("load", "coulomb"):
         for gain in GAINS:
             fitted = [log for log in logs.values() if log.constants["kp"] != gain]
             held_out = [log for log in logs.values() if log.constants["kp"] == gain]

@@ -182,8 +182,7 @@ def write_page(result: Identified, page: Path) -> None:
         print(f"wrote {page}")
     except ModuleNotFoundError as error:
         print(
-            f"no {page}: {error}; pages need the extra 'validate': pip install"
-            " 'codrl-mj[validate]'"
+            f"no {page}: {error}; pages need the extra 'validate': pip install 'codrl-mj[validate]'"
         )
 
 

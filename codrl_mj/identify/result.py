@@ -190,9 +190,9 @@ def closed_loop_error(fit: Fit[ShaftModel], log: Log) -> float | None:
 
 def _error_under_command(fit: Fit[ShaftModel], log: Log) -> float:
     """Return the mean absolute error [rad] of a servo over a whole log, from its first row."""
-    simulate, errors = fit.model.simulator(fit.values), []
-    for segment in dataclasses.replace(fit.model, segment=math.inf).segments([log]):
-        errors.append(np.abs(simulate(segment, segment.state) - segment.measured))
+    simulate = fit.model.simulator(fit.values)
+    segments = dataclasses.replace(fit.model, segment=math.inf).segments([log])
+    errors = [np.abs(simulate(segment, segment.state) - segment.measured) for segment in segments]
     return float(np.concatenate(errors).mean())
 
 

@@ -55,7 +55,7 @@ _LOOP_PERIOD = 1e-3
 _MIN_SHARE = 0.005
 """Smallest relative half-width, because no load is weighed and measured more exactly."""
 _LIMITED = 0.002
-"""Share of the rows in which the torque must exceed its limit, so that the limit is told."""
+"""Share of the rows in which the torque must exceed its limit for the limit to be identified."""
 _MAX_LIMITED_COST = 0.6
 """Largest cost of a fit with a limit of the torque, over that without, at which it is accepted."""
 _DELAY_ROWS = 3.0
@@ -148,6 +148,7 @@ def identify_servo(
         unexplained=unexplained,
         friction_reason=friction_reason,
         step=float(np.median([log.step for log in logs])),
+        limits_torque=fit.model.limits_torque,
         is_scaled=arguments.is_scaled,
         gain=None if math.isnan(arguments.gain) else arguments.gain,
     )
@@ -384,9 +385,7 @@ def _finish(
     return [by_name[name] for name in PARAMETERS if name in by_name]
 
 
-def _with_other_law(
-    estimate: Estimate, other: float, by_name: Mapping[str, Estimate]
-) -> Estimate:
+def _with_other_law(estimate: Estimate, other: float, by_name: Mapping[str, Estimate]) -> Estimate:
     """Return a stall torque that covers the value by the other law, if that lies outside."""
     if estimate.low <= other <= estimate.high:
         return estimate
@@ -513,9 +512,7 @@ def _derived(
     return derived | _electrical(stall, damping, arguments)
 
 
-def _electrical(
-    stall: Estimate, damping: Estimate, arguments: _Arguments
-) -> dict[str, Estimate]:
+def _electrical(stall: Estimate, damping: Estimate, arguments: _Arguments) -> dict[str, Estimate]:
     """Return R, kT and viscous friction, if R or kT and the supply voltage are known.
 
     Commands and positions show only kT/R, in the stall torque, and the sum of kT*kE/R and the
@@ -562,4 +559,3 @@ def _per_inertia(by_name: Mapping[str, Estimate]) -> dict[str, Estimate]:
         else:
             renamed[name] = estimate
     return renamed
-

@@ -1,6 +1,7 @@
 """Model of a position servo that is fitted to its commands and encoder."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple, Self
@@ -135,7 +136,7 @@ class ServoModel(ShaftModel):
 
         return simulate
 
-    def segments(self, logs: Sequence[Log], min_step: float = 0.0) -> list[Segment]:
+    def segments(self, logs: Sequence[Log], min_step: float = 0.0) -> list[Segment]:  # noqa: ARG002
         """Cut logs into segments with the commands that lead to them; no rows are combined."""
         segments: list[Segment] = []
         block = -1
@@ -190,7 +191,9 @@ class ServoModel(ShaftModel):
         servo = self.servo_parameters(values)
         errors = [angle_errors(segment, servo.command_delay) for segment in segments]
         torque = servo.position_gain * np.concatenate(errors)
-        return float(np.sqrt(np.mean(np.clip(torque, -servo.stall_torque, servo.stall_torque) ** 2)))
+        return float(
+            np.sqrt(np.mean(np.clip(torque, -servo.stall_torque, servo.stall_torque) ** 2))
+        )
 
     def initial_guess(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
         """Return the model with its free parameters set, and two initial guesses.
@@ -212,9 +215,7 @@ class ServoModel(ShaftModel):
         candidates = [self._values_of(guess, segments) for guess in guesses]
         scales = np.array([candidates[0].sizes[name] for name in free])
         positive = np.array([PARAMETERS[name].lower >= 0.0 for name in free], bool)
-        starts = [
-            np.array([candidate.start[name] for name in free]) for candidate in candidates
-        ]
+        starts = [np.array([candidate.start[name] for name in free]) for candidate in candidates]
         starts = [
             np.where(positive & ~(values > 0.02 * scales), 0.3 * scales, values)
             for values in starts
@@ -255,7 +256,9 @@ class ServoModel(ShaftModel):
                 # A change of a few parameters improves more often than a change of all of them.
                 chosen = random.random(len(best)) < 2.5 / len(best)
                 change = spread * random.standard_normal(len(best)) * chosen
-                values = np.where(positive, best * np.exp(change), best + 2.0 * change * self.scales)
+                values = np.where(
+                    positive, best * np.exp(change), best + 2.0 * change * self.scales
+                )
                 # A delay and a damping cause the same lag behind a slow command.
                 if lags and random.random() < 0.5:
                     lag = spread * 0.02 * random.standard_normal()
@@ -266,9 +269,7 @@ class ServoModel(ShaftModel):
                     best_error, best = new_error, values
         return [best, regressed]
 
-    def _values_of(
-        self, guess: _Guess, segments: Sequence[Segment]
-    ) -> _Candidate:
+    def _values_of(self, guess: _Guess, segments: Sequence[Segment]) -> _Candidate:
         """Return all parameters of a guess, and the typical size of each."""
         parameters = {**self.defaults, **self.known}
         inertia, damping, coulomb, gravity, constant = map(float, guess.coefficients)
@@ -364,7 +365,7 @@ class _Regression:
             moves = np.array(
                 [
                     np.abs(speed[start : end + 1]).min() > creeping
-                    for start, end in zip(edges[:-1], edges[1:], strict=True)
+                    for start, end in itertools.pairwise(edges)
                 ],
                 bool,
             )

@@ -27,6 +27,8 @@ class IdentifiedServo(Identified):
     """True if torques are in N*m; False if only their ratios to the inertia are known."""
     gain: float | None = None
     """Register that the position gain refers to; None: none was logged."""
+    limits_torque: bool = False
+    """True if the stall torque limits the torque after the damping, as a current loop does."""
     step: float = 0.005
     """Median time between two commands [s]."""
 
@@ -41,6 +43,12 @@ class IdentifiedServo(Identified):
                 " armature=VALUE or stall_torque=VALUE"
             )
         by_name = {estimate.name: estimate for estimate in self.estimates}
+        if self.limits_torque:
+            return (
+                "the limit acts on the torque, as that of a current loop does, and not on the"
+                " duty: the family pwm_servo has no such limit. In MuJoCo, use"
+                f" {self.position_element()}"
+            )
         lacking = [name for name in _NEEDED if name not in by_name]
         if lacking == ["armature"] and "inertia" in by_name:
             return (
@@ -59,6 +67,18 @@ class IdentifiedServo(Identified):
         if lacking:
             return f"{', '.join(lacking)}: the logs do not determine them"
         return None
+
+    def position_element(self) -> str:
+        """Return MuJoCo's `<position>` and the attributes of its joint, with these torques."""
+        values = {estimate.name: estimate.value for estimate in self.estimates}
+        viscous = values.get("viscous_friction", 0.0)
+        return (
+            f'<position kp="{values["position_gain"]:.4g}"'
+            f' kv="{max(values["damping"] - viscous, 0.0):.4g}"'
+            f' forcerange="{-values["stall_torque"]:.4g} {values["stall_torque"]:.4g}"/> at a joint'
+            f' with damping="{viscous:.4g}", frictionloss="{values["coulomb_friction"]:.4g}" and'
+            f' armature="{values.get("armature", 0.0):.4g}"'
+        )
 
     @property
     def supply_text(self) -> str | None:
@@ -145,4 +165,3 @@ class IdentifiedServo(Identified):
             and estimate.status in USABLE
             and estimate.low < estimate.high
         }
-
