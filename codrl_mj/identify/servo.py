@@ -313,11 +313,13 @@ def _with_limited_torque(fit: Fit[ServoModel]) -> Fit[ServoModel]:
         scales=np.append(fit.model.scales, max(damping, 1e-9)),
     )
     largest = largest_torque(model, np.append(fit.values, 0.0), fit.segments, 1.0)
-    fits = []
+    # With all of the damping as viscous friction, this law is that of a limited duty.
+    starts = [np.append(fit.values, 0.95 * damping)]
     for share in (0.3, 0.5, 0.8):
         start = np.append(fit.values, 0.1 * damping)
         start[names.index("stall_torque")] = share * largest
-        fits.append(optimize(model, fit.segments, start, 8, fit.scale))
+        starts.append(start)
+    fits = [optimize(model, fit.segments, start, 8, fit.scale) for start in starts]
     best = min(fits, key=lambda one: one.costs(fit.scale).sum())
     return optimize(model, fit.segments, best.values, 40, fit.scale, best.states)
 
