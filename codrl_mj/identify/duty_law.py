@@ -56,11 +56,11 @@ def fit_duty_law(fit: Fit[ServoModel]) -> DutyLaw:
     )
     half_width = 2.0 * float(np.std(means)) + MIN_HALF_WIDTH * abs(slope)
     estimate = Estimate("duty_gain", slope, slope - half_width, slope + half_width, "identified")
-    if best_share <= MAX_UNEXPLAINED and half_width <= MAX_HALF_WIDTH * slope:
+    if slope > 0.0 and best_share <= MAX_UNEXPLAINED and half_width <= MAX_HALF_WIDTH * slope:
         return DutyLaw(estimate, "")
     text = (
-        f"the duty is not proportional to the angle error: {best_share:.0%} of it is unexplained."
-        " Check its sign and unit; it is not used"
+        f"the duty is not proportional to the angle error: {best_share:.0%} of it is unexplained"
+        f" by {slope:.3g} per rad. Check its sign and unit; it is not used"
     )
     return DutyLaw(dataclasses.replace(estimate, status="refused", why=text), text)
 

@@ -10,7 +10,13 @@ import numpy as np
 
 from codrl_mj.fields import check_names
 from codrl_mj.identify.duty_law import DutyLaw, fit_duty_law
-from codrl_mj.identify.estimate import MAX_COST_RATIO, Fit, fit_from_starts, optimize
+from codrl_mj.identify.estimate import (
+    MAX_COST_RATIO,
+    MAX_MEAN_RESIDUAL,
+    Fit,
+    fit_from_starts,
+    optimize,
+)
 from codrl_mj.identify.friction import choose_friction
 from codrl_mj.identify.identify import separate_logs
 from codrl_mj.identify.log import MAX_STEP, MIN_ROWS, Log, gapless_stretches, has_motion
@@ -285,13 +291,15 @@ def _fit(
     fit, start_fits = fit_from_starts(guessed, segments, starts, on_step)
     other_stall = math.nan
     if "stall_torque" in fit.model.names:
-        other = _with_limited_torque(fit)
-        costs = [float(one.costs(fit.scale).sum()) for one in (fit, other)]
-        # The law with one more parameter has to be clearly better.
-        if costs[1] < MAX_COST_RATIO * costs[0]:
-            fit, start_fits = other, (other,)
-        elif costs[0] > MAX_COST_RATIO * costs[1]:
-            other_stall = other.model.all_values(other.values)["stall_torque"]
+        # With large residuals, another law would only imitate what the model lacks.
+        if np.mean(np.abs(np.concatenate(fit.residuals))) < MAX_MEAN_RESIDUAL:
+            other = _with_limited_torque(fit)
+            costs = [float(one.costs(fit.scale).sum()) for one in (fit, other)]
+            # The law with one more parameter has to be clearly better.
+            if costs[1] < MAX_COST_RATIO * costs[0]:
+                fit, start_fits = other, (other,)
+            else:
+                other_stall = other.model.all_values(other.values)["stall_torque"]
         unlimited = _without_limit(fit)
         # Friction that the model lacks looks like a limit, but explains little of the residuals.
         costs = [float(one.costs(fit.scale).sum()) for one in (fit, unlimited)]
