@@ -46,7 +46,15 @@ WITH_PYTHON = [
 ]
 SLOW_PAGES = {
     f"docs/{name}.md"
-    for name in ("actuators", "external_envs", "identify", "motors", "see", "studies")
+    for name in (
+        "actuators",
+        "external_envs",
+        "identify",
+        "identify_servo",
+        "motors",
+        "see",
+        "studies",
+    )
 }
 """Pages that take more than three seconds even in short form."""
 COMMANDS = [
@@ -106,8 +114,8 @@ def reader_folder(trained, tmp_path, monkeypatch):
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_python_of_a_page_runs(page, monkeypatch):
-    if "data/bench_logs/dfki_pendulum" in PAGES[page]:
-        Path("data").symlink_to(published_folder("dfki_pendulum").parents[1])
+    if log_set := re.search("data/bench_logs/(\\w+)", PAGES[page]):
+        Path("data").symlink_to(published_folder(log_set[1]).parents[1])
     monkeypatch.setattr(Grid, "compute", lambda *_: None)  # hours
     namespace = {}
     for block in re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL):

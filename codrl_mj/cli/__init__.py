@@ -77,6 +77,7 @@ VERBS = {
     "identify check": "identify:CheckLogs",
     "identify columns": "identify:ProposeColumns",
     "identify plan": "identify:PlanExperiment",
+    "identify servo": "identify_servo:IdentifyServo",
     "identify simulate": "identify:SimulateLog",
     "identify compare": "deploy:CompareLog",
     "data": "runs:Data",

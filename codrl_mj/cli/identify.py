@@ -28,8 +28,8 @@ Columns = Annotated[
         help=(
             "Columns of the signals, such as"
             " time=t:s,voltage=duty*vbus:V,current=i:mA,position=q:deg. Signals are voltage,"
-            " current, position, velocity, torque, bus, duty, temperature and command; formulas can"
-            " contain + - * /, twos_complement(column,16), sign_magnitude(column,11),"
+            " current, position, velocity, torque, bus, duty, temperature, command and gain;"
+            " formulas can contain + - * /, twos_complement(column,16), sign_magnitude(column,11),"
             " unwrap(column,360), atan2(y,x), abs, sign, sqrt, and column[0] of a list"
             " (docs/identify_logs.md)."
         ),
@@ -140,19 +140,7 @@ class Identify:
                 )
             for path in result.write(self.out):
                 print(f"wrote {path}")
-            page = self.out / "report.html"
-            try:
-                # The page needs optional libraries. The results are already on disk, so a missing
-                # library is only reported.
-                from codrl_mj.viz.pages.identification import identification_page
-
-                identification_page(result, page)
-                print(f"wrote {page}")
-            except ModuleNotFoundError as error:
-                print(
-                    f"no {page}: {error}; pages need the extra 'validate': pip install"
-                    " 'codrl-mj[validate]'"
-                )
+            write_page(result, self.out / "report.html")
         units = {estimate.name: estimate.unit for estimate in result.estimates}
         has_result = problem is None or result.joint_text is not None
         return int(not has_result), result.as_mapping() | {"units": units}
@@ -188,6 +176,21 @@ class Identify:
                 style="yellow",
             )
         return [log for log in held_out if not any(log is bad_log for bad_log in bad_logs)]
+
+
+def write_page(result: Identified, page: Path) -> None:
+    """Write the page of an identification, or print what is missing for it."""
+    try:
+        # The page needs optional libraries. The results are already on disk, so a missing library
+        # is only reported.
+        from codrl_mj.viz.pages.identification import identification_page
+
+        identification_page(result, page)
+        print(f"wrote {page}")
+    except ModuleNotFoundError as error:
+        print(
+            f"no {page}: {error}; pages need the extra 'validate': pip install 'codrl-mj[validate]'"
+        )
 
 
 def print_identification(result: Identified) -> None:
@@ -323,6 +326,7 @@ LOAD, SENSING, SAMPLER = (
 class PlanExperiment:
     """Plan an experiment: excitation, amplitude and sample rate, with the expected errors.
 
+    It plans voltages for a motor; docs/identify_servo.md lists the commands for a position servo.
     The errors are lower bounds for a motor that agrees with its datasheet; on a real bench they are
     several times larger. Example: codrl-mj identify plan maxon-ec45-flat-50w --inertia 1e-4 --out
     plan
@@ -491,6 +495,12 @@ class SimulateLog:
         return 0
 
 
+def is_servo(columns: str) -> bool:
+    """Return True if a mapping has commands and positions, but no input of a motor."""
+    signals = {entry.partition("=")[0].strip() for entry in columns.split(",")}
+    return {"command", "position"} <= signals and not signals & {"voltage", "current", "torque"}
+
+
 def _sensors(texts: Sequence[str]) -> dict[str, Sensor]:
     from codrl_mj.fields import check_names
 
@@ -540,6 +550,8 @@ class ProposeColumns:
         is_open, verb, rig = f":{OPEN_UNIT}" in proposal.columns, "identify", ""
         if not is_open and self._has_errors(proposal.columns):
             verb = "identify check"
+        elif is_servo(proposal.columns):
+            verb, rig = "identify servo", " --load pendulum --known mass=0.5 length=0.1"
         elif re.search("(position|velocity)=", proposal.columns):
             rig = f" --rig {OPEN_RIG}"
         unit_hint = ", with its unit for each UNIT" if is_open else ""
@@ -548,6 +560,11 @@ class ProposeColumns:
             f"; {OPEN_RIG} is pendulum if a load hangs at position 0, load if the motor lifts one,"
             " and otherwise free (add --known load_inertia=0 if nothing is mounted on the motor)"
         )
+        if "servo" in verb:
+            rig_hint = (
+                ", for a servo with a pendulum of 0.5 kg at 0.1 m (--load free without a load, but"
+                " then torques are known only as ratios to the inertia)"
+            )
         print_text(f"next{unit_hint}{rig_hint if rig else ''}:")
         print(
             command(

@@ -1,5 +1,6 @@
 """Checks of a log before a fit, each registered with the conditions under which it applies."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -23,6 +24,7 @@ from codrl_mj.identify.log import (
     find_resolution,
     find_turn_jumps,
     has_motion,
+    is_servo_log,
     is_supply_voltage,
     replace_signal,
 )
@@ -70,6 +72,7 @@ and 0.93 in short windows.
 """
 _MAX_NOISE = 0.1
 """Noise-to-signal ratio above which no error of the velocity is reported."""
+_SERVO = "this log has commands and positions of a servo, but no voltage, current or torque"
 _MIN_TILT = 0.03
 """Smallest reported angle [rad] between the pendulum at rest and position 0."""
 
@@ -151,6 +154,9 @@ def explain_factor(ratio: float, angle: bool = True) -> str:
 def _obstacle(facts: LogFacts) -> Iterator[Finding]:
     """Find the reason why a fit would reject this log."""
     if finding := find_obstacle([facts.log]):
+        # A servo is identified from its commands and positions, without an input of its motor.
+        if finding.check == "signals" and is_servo_log(facts.log):
+            finding = dataclasses.replace(finding, severity="info", message=_SERVO)
         yield finding
 
 

@@ -13,7 +13,7 @@ from typing import ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from codrl_mj.identify.log import Log, Segment, shift_signal
+from codrl_mj.identify.log import Log, Segment, halve_rate, shift_signal
 from codrl_mj.identify.parameters import DEFAULTS, PARAMETERS
 
 # Dry friction makes the cost rough: smaller steps give useless derivatives.
@@ -65,6 +65,8 @@ class Model(abc.ABC):
     scales: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(0))
     """Typical size of each free parameter, > 0, shape (p,)."""
     steps: ClassVar[np.ndarray]  # steps of finite differences of the state, shape (s,)
+    difference_step: ClassVar[float] = DIFFERENCE_STEP
+    """Step of finite differences of the parameters, in their scales."""
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -85,6 +87,10 @@ class Model(abc.ABC):
     @abc.abstractmethod
     def segments(self, logs: Sequence[Log]) -> list[Segment]:
         """Cut logs into segments."""
+
+    def half_rate_segments(self, logs: Sequence[Log]) -> list[Segment]:
+        """Cut logs with every second row into segments."""
+        return self.segments([halve_rate(log) for log in logs])
 
     @abc.abstractmethod
     def initial_guess(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
@@ -256,8 +262,9 @@ class _Problem:
         self.states, self.slopes, self.origin = [fit.state for fit in fits], [], values.copy()
         model, jacobians = self.model, []
         # Steps must not leave the bounds.
-        signs = np.where(values + DIFFERENCE_STEP * model.scales > model.bounds[1], -1.0, 1.0)
-        changes = np.diag(signs * DIFFERENCE_STEP * model.scales)
+        steps = model.difference_step * model.scales
+        signs = np.where(values + steps > model.bounds[1], -1.0, 1.0)
+        changes = np.diag(signs * steps)
         simulators = [model.simulator(values + change) for change in changes]
         for segment, (state, residuals, state_columns) in zip(self.segments, fits, strict=True):
             columns = np.empty((len(residuals), len(values)))

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from codrl_mj.identify.log import SIGNALS, Log
 from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.result import predict
 
+ShaftT = TypeVar("ShaftT", bound=ShaftModel)
 # With fewer logs, the standard error of the mean improvement would be meaningless.
 MIN_LOGS = 3
 """Minimum number of moving logs for a cross-validation."""
@@ -23,17 +24,17 @@ _MIN_DIFFERENCE = 0.05
 """Smallest difference between the fitted efficiency and its default."""
 
 
-class FrictionChoice(NamedTuple):
+class FrictionChoice(NamedTuple, Generic[ShaftT]):
     """A shaft with the chosen friction model."""
 
-    model: ShaftModel
+    model: ShaftT
     reason: str
     """Reason for the choice; empty if the friction model was requested."""
 
 
 def choose_friction(
-    model: ShaftModel, logs: Sequence[Log], friction: str, on_step: Callable[[], None]
-) -> FrictionChoice:
+    model: ShaftT, logs: Sequence[Log], friction: str, on_step: Callable[[], None]
+) -> FrictionChoice[ShaftT]:
     """Return a shaft with the requested friction model or, for `auto`, with the best one.
 
     `auto` leaves out one log at a time and predicts it from a fit to the others. It begins with

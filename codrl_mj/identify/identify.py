@@ -26,7 +26,9 @@ from codrl_mj.identify.parameters import (
     ESTIMABLE,
     LOSS_PARAMETERS,
     PARAMETERS,
+    PER_INERTIA,
     RIG_PARAMETERS,
+    SERVO_PARAMETERS,
     WINDING_SOURCES,
 )
 from codrl_mj.identify.result import (
@@ -311,9 +313,8 @@ def check_arguments(
         )
     if not logs:
         raise ValueError("logs: none was given; give one or more")
-    check_names(
-        known, [name for name in PARAMETERS if name != "friction_torque"], "parameter", "known."
-    )
+    unknown = {"friction_torque", *SERVO_PARAMETERS, *PER_INERTIA}
+    check_names(known, [name for name in PARAMETERS if name not in unknown], "parameter", "known.")
     if rig is not None:
         check_names([rig], RIG_PARAMETERS, "rig")
     check_names([friction], ("auto", "coulomb", "stribeck", "load", "both"), "friction")

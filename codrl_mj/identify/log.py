@@ -18,6 +18,7 @@ SIGNALS = {
     "duty": "",  # share of the bus voltage
     "temperature": "degC",
     "command": None,  # setpoint of a controller, in any unit
+    "gain": "",  # register of a servo's position gain
 }
 """Signal of a log -> its SI unit; None: any."""
 # Nothing is simulated across a gap.
@@ -261,6 +262,11 @@ def find_obstacle(logs: Sequence[Log]) -> Finding | None:
     return None
 
 
+def is_servo_log(log: Log) -> bool:
+    """Return True if a log has commands and positions, from which a servo can be identified."""
+    return log.has("command", "position") and has_motion(log)
+
+
 def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
     """Return a finding that names the signals that a fit lacks, and how to get them."""
     signals = set().union(*(log.signals for log in logs))
@@ -273,9 +279,10 @@ def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
                 " supply has 12 V"
             )
         elif "command" in signals:
-            remedy += (
-                "; for a servo, log the duty (Feetech: Present Load, Dynamixel: Present PWM) and"
-                " the input voltage"
+            remedy = (
+                "identify the servo as a whole: codrl-mj identify servo. It tells more if you also"
+                " log the duty (Feetech: Present Load, Dynamixel: Present PWM) and the input"
+                " voltage"
             )
     elif is_moving:
         lacking = "no torque, current or voltage that all moving logs have"
@@ -315,6 +322,15 @@ MIN_MOTION_STEPS = 10.0
 """Motion in encoder steps below which a shaft counts as locked."""
 
 
+class ServoInputs(NamedTuple):
+    """Commands of a servo until the end of a segment, and what scales its torque."""
+
+    times: np.ndarray  # times of the log's rows until the end of the segment [s], shape (n,)
+    targets: np.ndarray  # commanded positions at these rows [rad], shape (n,)
+    volts: np.ndarray  # supply voltage over its reference at the segment's rows, shape (m,)
+    gains: np.ndarray  # position gain over its reference at the segment's rows, shape (m,)
+
+
 class Segment(NamedTuple):
     """Rows of a log that are simulated from one initial state."""
 
@@ -328,6 +344,7 @@ class Segment(NamedTuple):
     measured: np.ndarray  # output that a simulation is compared with, shape (m,)
     deviation: float  # standard deviation of the sensor, in the unit of `measured`
     state: np.ndarray  # initial guess of the state at the first row
+    servo: ServoInputs | None = None  # inputs of a servo; None: the segment is not of a servo
 
     def first(self, count: int) -> "Segment":
         """Return a segment of the first `count` rows."""

@@ -209,6 +209,11 @@ class ShaftModel(Model):
             segment.times, segment.inputs, segment.slopes, state[0], state[1], shaft
         )[output_index]
 
+    def driving_torque(self, values: np.ndarray, segments: Sequence[Segment]) -> float:
+        """Return the RMS of the driving torque [N*m] at the output."""
+        inputs = np.concatenate([segment.inputs for segment in segments])
+        return float(np.sqrt(np.mean(inputs**2))) * self.shaft_parameters(values).gain
+
     def segments(self, logs: Sequence[Log], min_step: float = SHAFT_STEP) -> list[Segment]:
         """Cut logs into segments; rows that are closer than `min_step` [s] are combined."""
         from scipy.integrate import cumulative_trapezoid

@@ -43,8 +43,38 @@ PARAMETERS = {
     "rotor_inertia": Parameter("kg*m^2", 0.0, 1e3, "inertia of the rotor"),
     "load_inertia": Parameter("kg*m^2", 0.0, 1e4, "inertia at the output without the motor's"),
     "gear_ratio": Parameter("", 1e-3, 1e5, "turns of the rotor per turn of the output", 1.0),
+    # Parameters of a position servo, see `codrl_mj.identify.servo`.
+    "position_gain": Parameter("N*m/rad", 1e-6, 1e7, "torque per angle error, at the output"),
+    "damping": Parameter(
+        "N*m*s/rad", 0.0, 1e4, "loss of torque per speed: viscous, by back-EMF and derivative gain"
+    ),
+    "armature": Parameter("kg*m^2", 0.0, 1e3, "inertia of the servo, at the output"),
+    "stall_torque": Parameter("N*m", 1e-6, 1e6, "largest torque at standstill, at the output"),
+    "duty_gain": Parameter("1/rad", 1e-6, 1e6, "duty per angle error"),
+    # A command that is logged after it was sent has a negative delay.
+    "command_delay": Parameter("s", -0.1, 0.5, "time from the logged command to the torque"),
+    "zero": Parameter("rad", -3.2, 3.2, "position at which the pendulum hangs", 0.0),
+    "max_velocity": Parameter("rad/s", 1e-3, 1e4, "largest speed of the target", 1e4),
+    "no_load_speed": Parameter("rad/s", 1e-6, 1e6, "speed of the servo without a load"),
+    # Without a known load, only these ratios to the moving inertia can be told.
+    "position_gain_per_inertia": Parameter("1/s^2", 1e-6, 1e12, "position gain over inertia"),
+    "stall_torque_per_inertia": Parameter("rad/s^2", 1e-6, 1e12, "stall torque over inertia"),
+    "damping_per_inertia": Parameter("1/s", 0.0, 1e9, "damping over inertia"),
+    "coulomb_friction_per_inertia": Parameter("rad/s^2", 0.0, 1e9, "Coulomb friction over inertia"),
+    "stribeck_friction_per_inertia": Parameter(
+        "rad/s^2", 0.0, 1e9, "additional static friction over inertia"
+    ),
+    "friction_torque_per_inertia": Parameter("rad/s^2", 0.0, 1e9, "total friction over inertia"),
+    "mgl_per_inertia": Parameter("1/s^2", 0.0, 1e9, "largest gravity torque over inertia"),
 }
 """All parameters. Each can be known in advance, except `friction_torque`, which is derived."""
+SERVO_PARAMETERS = (
+    *("position_gain", "stall_torque", "duty_gain", "command_delay", "max_velocity"),
+    *("damping", "armature", "zero", "no_load_speed"),
+)
+"""Parameters that only a position servo has."""
+PER_INERTIA = tuple(name for name in PARAMETERS if name.endswith("_per_inertia"))
+"""Parameters of a servo over its moving inertia."""
 ELECTRICAL = ("resistance", "inductance", "back_emf_constant")
 FRICTION = (
     "coulomb_friction",
@@ -52,11 +82,17 @@ FRICTION = (
     "stribeck_friction",
     "gear_efficiency",
     "friction_torque",
+    "damping",
 )
 """Friction parameters, whose true value may be 0, or 1 for `gear_efficiency`.
 
 Their intervals are judged relative to the total friction, because a relative error is meaningless
 for a value near 0.
+"""
+MIN_SIZES = {"command_delay": 0.01, "zero": 0.1}
+"""Parameter -> smallest size that relative half-widths refer to.
+
+The true value may be 0, and smaller errors hardly change a motion.
 """
 MOTOR_PARAMETERS = (
     *(

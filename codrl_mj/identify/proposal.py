@@ -17,6 +17,7 @@ from codrl_mj.identify.log import (
     find_obstacle,
     find_resolution,
     find_turn_jumps,
+    is_servo_log,
     is_supply_voltage,
 )
 from codrl_mj.identify.reading import STAMP, Table, read_table, table_to_log
@@ -512,5 +513,7 @@ def _problem(name: str, table: Table, entries: dict[str, _Entry]) -> str | None:
     obstacle = find_obstacle([log])
     # While the unit of time is open, the rows may still be frequent enough.
     if obstacle is None or (obstacle.check == "rows" and entries["time"].unit == OPEN_UNIT):
+        return None
+    if obstacle.check == "signals" and is_servo_log(log):
         return None
     return f"{obstacle.message}; {obstacle.remedy}"

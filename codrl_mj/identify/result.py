@@ -166,6 +166,8 @@ def closed_loop_error(fit: Fit[ShaftModel], log: Log) -> float | None:
     from codrl_mj.identify.simulation import simulate_servo
 
     model = fit.model
+    if model.driven_by == "command":
+        return _error_under_command(fit, log)
     if model.output != "position" or not log.has("command", model.driven_by):
         return None
     target, drive = log.signals["command"], log.signals[model.driven_by]
@@ -195,6 +197,14 @@ def closed_loop_error(fit: Fit[ShaftModel], log: Log) -> float | None:
         errors.append(np.abs(simulated - log.signals["position"][stretch]))
     mean_error = float(np.concatenate(errors).mean())
     return mean_error if math.isfinite(mean_error) else None
+
+
+def _error_under_command(fit: Fit[ShaftModel], log: Log) -> float:
+    """Return the mean absolute error [rad] of a servo over a whole log, from its first row."""
+    simulate = fit.model.simulator(fit.values)
+    segments = dataclasses.replace(fit.model, segment=math.inf).segments([log])
+    errors = [np.abs(simulate(segment, segment.state) - segment.measured) for segment in segments]
+    return float(np.concatenate(errors).mean())
 
 
 def fitted_traces(part: str, fit: Fit[Model]) -> Iterator[Trace]:

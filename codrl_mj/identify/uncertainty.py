@@ -18,7 +18,13 @@ from codrl_mj.identify.estimate import Fit, Misfit, Model, fit_warnings, optimiz
 from codrl_mj.identify.invariances import invariant_directions
 from codrl_mj.identify.log import BLOCK_DURATION, Log, halve_rate, has_motion, replace_signal
 from codrl_mj.identify.models import ShaftModel, WindingModel
-from codrl_mj.identify.parameters import DEFAULTS, FRICTION, PARAMETERS, WINDING_SOURCES
+from codrl_mj.identify.parameters import (
+    DEFAULTS,
+    FRICTION,
+    MIN_SIZES,
+    PARAMETERS,
+    WINDING_SOURCES,
+)
 from codrl_mj.identify.result import MAX_UNEXPLAINED, USABLE, Estimate, Status
 
 MIN_LOGS = 5
@@ -72,6 +78,10 @@ CAUSES = {
     "self_test": "a fit to its own simulation gives another value",
     "unexplained": "the model does not explain the current",
     "torque_constant": "the constant of the winding that it depends on is not known better",
+    "limit": "the logs do not tell if the duty is limited, or the torque",
+    "loop": "the period of the firmware's loop is unknown",
+    "load": "loads are not known more exactly",
+    "row": "a row does not show when within it a command is sent",
 }
 """Cause of an interval's width -> its description."""
 MIN_SEGMENT_ROWS = 20
@@ -168,7 +178,11 @@ def _assess_part(fit: Fit[Model], seed: int, on_step: Callable[[], None]) -> lis
     # Relative errors refer to the value of a parameter. For a friction parameter they refer to the
     # value at which it alone would account for all friction.
     magnitudes = [
-        full_friction[name] if name in FRICTION else abs(fit.values[index])
+        (
+            full_friction[name]
+            if name in FRICTION
+            else max(abs(fit.values[index]), MIN_SIZES.get(name, 0.0))
+        )
         for index, name in enumerate(names)
     ]
     scales = np.maximum(magnitudes, 1e-6 * model.scales)
@@ -401,19 +415,23 @@ def _total_friction(fit: Fit[Model]) -> tuple[float, dict[str, float], dict[str,
         ]
     )
     speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-9) * parameters["gear_ratio"]
-    inputs = np.concatenate([segment.inputs for segment in fit.segments])
-    torque = (
-        float(np.sqrt(np.mean(inputs**2)))
-        * model.shaft_parameters(fit.values).gain
-        / parameters["gear_ratio"]
-    )
-    slopes = {"coulomb_friction": 1.0, "viscous_friction": speed, "gear_efficiency": -torque}
+    torque = model.driving_torque(fit.values, fit.segments) / parameters["gear_ratio"]
+    slopes = {
+        "coulomb_friction": 1.0,
+        "viscous_friction": speed,
+        "damping": speed,
+        "gear_efficiency": -torque,
+    }
     gear_loss = slopes["gear_efficiency"] * (parameters["gear_efficiency"] - 1.0)
-    friction = parameters["coulomb_friction"] + parameters["viscous_friction"] * speed + gear_loss
+    # The damping of a servo contains its viscous friction.
+    viscous = parameters.get("damping", parameters.get("viscous_friction", 0.0))
+    friction = parameters["coulomb_friction"] + viscous * speed + gear_loss
     full_friction = {
         name: (friction + 1e-2 * torque) / max(abs(slopes.get(name, 1.0)), 1e-300)
         for name in FRICTION
     }
+    if "damping" in parameters:
+        slopes["viscous_friction"] = 0.0
     return (
         friction,
         slopes,
@@ -526,7 +544,8 @@ def interval_causes(
     # If an error is proportional to the time step, halving the rate changes the fit by as much as
     # the error at the full rate. If the error grows only with the root of the step, it is larger
     # than that change. For a winding the change is therefore doubled.
-    half_rate_values = _refit_values(fit, [halve_rate(log) for log in fit.logs])
+    half_rate = fit.model.half_rate_segments(fit.logs)
+    half_rate_values = optimize(fit.model, half_rate, fit.values, 20).values
     causes["half_rate"] = (2.0 if is_winding else 1.0) * np.abs(
         matrix @ (half_rate_values - fit.values)
     )
@@ -591,6 +610,41 @@ def resampled_half_widths(
         correction = t.ppf(0.975, count - 1) / t.ppf(0.975, 1e6) * np.sqrt(count / (count - 1.0))
         resampling = np.maximum(-low, high) * correction
     return {"curvature": curvature, "resampling": resampling, "logs": logs}
+
+
+def log_disagreements(fit: Fit[Model]) -> dict[str, float]:
+    """Return how far the logs' own values lie outside the 99 % intervals of single logs.
+
+    A Gauss-Newton step from the common fit gives the value of a single log, and the differences
+    between its blocks give the standard error of that value. The level of 99 % holds for all
+    parameters together. Parameters that no log contradicts are left out.
+    """
+    from scipy.stats import norm
+
+    names, blocks = fit.model.names, [segment.block for segment in fit.segments]
+    logs = [segment.log for segment in fit.segments]
+    if len(set(logs)) < 2 or not names:
+        return {}
+    scales = np.maximum(np.abs(fit.values), fit.model.scales)
+    limit = norm.ppf(1.0 - 0.005 / len(names))
+    gaps = np.zeros(len(names))
+    for log in sorted(set(logs)):
+        own = [index for index, number in enumerate(logs) if number == log]
+        part = dataclasses.replace(
+            fit,
+            segments=[fit.segments[index] for index in own],
+            residuals=tuple(fit.residuals[index] for index in own),
+            jacobians=tuple(fit.jacobians[index] for index in own),
+        )
+        gradients, matrices = _gauss_newton_sums(part, [blocks[index] for index in own])
+        count = len(gradients)
+        if count < 2:
+            continue
+        inverse = _inverse(matrices.sum(axis=0), scales)
+        steps = gradients @ inverse
+        errors = np.sqrt(count / (count - 1.0) * np.sum((steps - steps.mean(axis=0)) ** 2, axis=0))
+        gaps = np.maximum(gaps, np.abs(steps.sum(axis=0)) - limit * errors)
+    return {name: float(gap) for name, gap in zip(names, gaps, strict=True) if gap > 0.0}
 
 
 def correlations(fit: Fit[Model]) -> dict[str, dict[str, float]]:

@@ -37,6 +37,13 @@ _ADVICE = {
     "friction_torque": "log longer, and several speeds in both directions",
     "gear_efficiency": "repeat the motion with two loads at least, driving and braking",
     "stribeck_friction": "creep: log very slow motion out of standstill",
+    "position_gain": "hang a heavier pendulum on it, and hold it at several angles",
+    "stall_torque": "command large steps, so that the duty reaches its limit, or log the duty",
+    "duty_gain": "log the duty (Feetech: Present Load, Dynamixel: Present PWM)",
+    "damping": "command several speeds up to the highest, in both directions",
+    "armature": "command steps, and sweep a sine up to the servo's bandwidth",
+    "command_delay": "log more often, and command steps",
+    "zero": "swing through the middle, or give --known zero=…",
     "stribeck_speed": "creep: log speeds from standstill to where friction is least",
 }
 
