@@ -53,6 +53,7 @@ from codrl_mj.actuators.parameters import (
 )
 from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
+from codrl_mj.actuators.shared_drive import SharedDrive, SharedSupply, SharedVoltageDrive
 from codrl_mj.actuators.stability import check_stable, spectral_radii, spectral_radius
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 from codrl_mj.user_code import allow_imports
@@ -79,6 +80,9 @@ __all__ = [
     "SampledLoop",
     "Servo",
     "ServoLoop",
+    "SharedDrive",
+    "SharedSupply",
+    "SharedVoltageDrive",
     "Supply",
     "TorqueSpeed",
     "UnstableError",
