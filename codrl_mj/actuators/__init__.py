@@ -53,7 +53,12 @@ from codrl_mj.actuators.parameters import (
 )
 from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
-from codrl_mj.actuators.shared_drive import SharedDrive, SharedSupply, SharedVoltageDrive
+from codrl_mj.actuators.shared_drive import (
+    SharedDrive,
+    SharedSupply,
+    SharedVoltageDrive,
+    check_supplies,
+)
 from codrl_mj.actuators.stability import check_stable, spectral_radii, spectral_radius
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 from codrl_mj.user_code import allow_imports
@@ -92,6 +97,7 @@ __all__ = [
     "override_actuator",
     "check_same_family",
     "check_stable",
+    "check_supplies",
     "electrical_step",
     "family_name",
     "family_id",

@@ -15,13 +15,21 @@ drives of a model whose supplies have the same number. `advance` does it for a s
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, NamedTuple
+
+import numpy as np
 
 from codrl_mj.actuators import drive, sampled, shaft
 from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.drive import Drive, State
-from codrl_mj.actuators.model import Command, FamilyTuple, Inputs
+from codrl_mj.actuators.model import (
+    ActuatorModel,
+    Command,
+    FamilyTuple,
+    Inputs,
+    UnstableError,
+)
 from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 from codrl_mj.actuators.shaft import Shaft, StepAverages, Winding
@@ -437,3 +445,71 @@ class SharedVoltageDrive(SharedDrive):
     is_torque_controlled: ClassVar[bool] = False
     CLOSED: ClassVar[bool] = False
     advance: ClassVar = staticmethod(_advance_driven)
+
+
+def check_supplies(actuators: Mapping[str, ActuatorModel], allow_unstable: bool = False) -> None:
+    """Raise if motors with the same supply number contradict each other, or oscillate together.
+
+    Args:
+        actuators: name -> actuator of a model; those without a shared supply are left out.
+        allow_unstable: accept motors that oscillate.
+
+    Raises:
+        ValueError: motors of a supply differ in the supply's fields or in their sample rates.
+        UnstableError: the saturated motors of a supply oscillate through its resistance.
+    """
+    drives = {
+        name: actuator for name, actuator in actuators.items() if isinstance(actuator, SharedDrive)
+    }
+    for number in sorted({motor.shared_supply.number for motor in drives.values()}):
+        members = {
+            name: motor for name, motor in drives.items() if motor.shared_supply.number == number
+        }
+        first_name, first = next(iter(members.items()))
+        for name, motor in members.items():
+            for field, value, other in (
+                *_differences(motor.shared_supply, first.shared_supply),
+                (
+                    "controller.sample_rate",
+                    motor.controller.sample_rate,
+                    first.controller.sample_rate,
+                ),
+            ):
+                if value != other:
+                    raise ValueError(
+                        f"{name}: {field} = {value}: must be {other} as for {first_name}, because"
+                        f" both are on supply {number}; or give it another supply.number"
+                    )
+        smallest = _smallest_eigenvalue(list(members.values()))
+        if smallest <= -1.0 and not allow_unstable:
+            raise UnstableError(
+                f"{', '.join(members)}: saturated together, they oscillate through"
+                f" supply.resistance = {first.shared_supply.resistance:g}: eigenvalue"
+                f" {smallest:.4g} over a sample, must be > -1. Raise controller.sample_rate, lower"
+                " supply.resistance, or pass allow_unstable=True to study it as it is"
+            )
+
+
+def _differences(
+    supply: SharedSupply, other: SharedSupply
+) -> list[tuple[str, float | bool, float | bool]]:
+    """Return name, value and the other's value of all fields of a supply."""
+    return [
+        (f"supply.{field.name}", getattr(supply, field.name), getattr(other, field.name))
+        for field in dataclasses.fields(supply)
+    ]
+
+
+def _smallest_eigenvalue(motors: Sequence[SharedDrive]) -> float:
+    """Return the smallest eigenvalue over a sample of saturated motors that share a supply.
+
+    A current decays by exp(-R*T/L), and the sum of all currents lowers the voltage. Fewer saturated
+    motors have larger eigenvalues.
+    """
+    resistances = np.array([motor.motor.resistance for motor in motors])
+    inductances = np.array([motor.motor.inductance for motor in motors])
+    decay = np.exp(-resistances / (inductances * motors[0].controller.sample_rate))
+    # Scaled by these roots, the matrix diag(decay) - Rs*gain*ones is symmetric.
+    roots = np.sqrt((1.0 - decay) / resistances)
+    coupling = motors[0].shared_supply.resistance * np.outer(roots, roots)
+    return float(np.linalg.eigvalsh(np.diag(decay) - coupling)[0])

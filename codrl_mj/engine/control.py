@@ -73,17 +73,6 @@ def _is_ours(model: int, actuator: int) -> bool:
 
 
 @internal(inline="always")
-def _commit(family_number: int, slot: int, time: float) -> None:
-    """Commit an actuator's candidate state if time has advanced.
-
-    The engine may call `control` several times at one time (mj_forward, then mj_step). The
-    candidate state becomes the state only after time has advanced.
-    """
-    if time != f64(slot)[0]:
-        commit_slot(family_number, slot, time)
-
-
-@internal(inline="always")
 def _is_on_supply(model: int, actuator: int, number: float) -> bool:
     """Return True if an enabled actuator of ours is on the supply of a number."""
     if not _is_ours(model, actuator) or is_disabled(model, actuator):
@@ -111,7 +100,8 @@ def _advance_supply_of(model: int, data: int, first: int) -> None:
             continue
         user, slot = user_address(model, actuator), _slot_of(model, data, actuator)
         family_number, out = int(f64(user)[2]), MODEL.actuator_outadr(model)[actuator]
-        _commit(family_number, slot, time)
+        if f64(slot)[0] != time:
+            commit_slot(family_number, slot, time)
         write_row(
             row,
             family_number,
@@ -155,7 +145,10 @@ def motor_callbacks() -> dict[str, CFunction]:
             if shares_supply(family_number):
                 _advance_supply_of(model, data, actuator)
                 continue
-            _commit(family_number, slot, time)
+            # The engine may call this several times at one time (mj_forward, then mj_step). The
+            # candidate state becomes the state only after time has advanced.
+            if time != f64(slot)[0]:
+                commit_slot(family_number, slot, time)
             out = MODEL.actuator_outadr(model)[actuator]
             advance_slot(
                 family_number,
