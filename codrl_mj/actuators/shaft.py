@@ -304,8 +304,7 @@ def winding_means(
 def pieces_of_step(
     parameters: Parameters, resistance: float, duration: float, samples: int, inertia: float
 ) -> int:
-    """Return the number of pieces, each with a new speed, into which `advance_motor` divides time.
-    """
+    """Return the number of pieces, with a speed each, into which `advance_motor` divides time."""
     braking = parameters.torque_constant * parameters.back_emf_constant / resistance
     braking += parameters.viscous_friction
     return min(max(math.ceil(2.0 * duration * braking / inertia), 1), samples)

@@ -78,9 +78,7 @@ def _is_on_supply(model: int, actuator: int, number: float) -> bool:
     if not _is_ours(model, actuator) or is_disabled(model, actuator):
         return False
     user = user_address(model, actuator)
-    return (
-        shares_supply(int(f64(user)[2])) and supply_number(user + 8 * USER_HEADER_SIZE) == number
-    )
+    return shares_supply(int(f64(user)[2])) and supply_number(user + 8 * USER_HEADER_SIZE) == number
 
 
 @internal

@@ -118,8 +118,14 @@ def advance_supply(rows: int, count: int, timestep: float) -> float:
 
 
 @internal
-def bus_voltage(work: Pointer[float] | np.ndarray, size: int, count: int, source: float,
-                resistance: float, recharges: bool) -> float:
+def bus_voltage(
+    work: Pointer[float] | np.ndarray,
+    size: int,
+    count: int,
+    source: float,
+    resistance: float,
+    recharges: bool,
+) -> float:
     """Return the voltage [V] of a supply at a sample, from wanted voltages and currents.
 
     The largest solution of the equation in `shared_drive` is found from above: the drives are taken
@@ -188,9 +194,7 @@ def load_supplies() -> CompiledCallback[[int, int, float], float]:
         values = f64(row)
         return Inputs(values[4], values[5], values[6], values[7], values[8], values[9])
 
-    @cfunc(
-        types.float64(types.uintp, types.int64, types.float64), nogil=True, error_model="numpy"
-    )
+    @cfunc(types.float64(types.uintp, types.int64, types.float64), nogil=True, error_model="numpy")
     def advance(rows: int, count: int, timestep: float) -> float:
         memory = stack_floats(_WORK_SIZE * count)
         work = entry_address(memory, 0)

@@ -77,12 +77,11 @@ def voltage_by_search(source, resistance, wanted, currents):
     """Return the largest solution of the supply's equation, by a search from above."""
 
     def excess(voltage):
-        powers = np.clip(wanted, -voltage, voltage) * currents
-        return source - resistance * powers.sum() / voltage - voltage
+        powers = [np.clip(w, -voltage, voltage) * i for w, i in zip(wanted, currents, strict=True)]
+        return source - resistance * sum(powers) / voltage - voltage
 
     grid = np.geomspace(source + resistance * np.abs(currents).sum() + 1.0, 1e-3, 20001)
-    values = np.array([excess(voltage) for voltage in grid])
-    crossings = np.flatnonzero(values >= 0.0)
+    crossings = np.flatnonzero(excess(grid) >= 0.0)
     if not crossings.size:
         return 0.0
     return brentq(excess, grid[crossings[0]], grid[crossings[0] - 1], xtol=1e-13, rtol=1e-14)
@@ -133,7 +132,9 @@ def integrated(motors, commands, speeds, supply, steps):
 def test_currents_and_energy_are_those_of_a_stiff_integration(commands, speeds):
     supply, steps = SharedSupply(12.0, 0.15), 3
     motors = [motor_of(n, supply, SharedVoltageDrive) for n in range(len(commands))]
-    data, signals = run(wheels(motors), np.array(commands) * CONSTANTS[: len(motors)], speeds, steps)
+    data, signals = run(
+        wheels(motors), np.array(commands) * CONSTANTS[: len(motors)], speeds, steps
+    )
     currents, energies = integrated(motors, np.array(commands), np.array(speeds), supply, steps)
     # `advance` has committed the state, whose first entry is the current.
     starts = data.model.plugin_stateadr[data.model.actuator_plugin] + SLOT_HEADER_SIZE
@@ -228,7 +229,9 @@ def test_both_backends_and_batches_have_the_same_bits(integrator):
 def test_a_source_that_does_not_recharge_stays_at_its_voltage():
     speeds, torques = [150.0, 10.0], [-0.2, 0.02]
     signals = [
-        run(wheels([motor_of(n, SharedSupply(12.0, 0.5, 1, flag)) for n in (1, 1)]), torques, speeds)
+        run(
+            wheels([motor_of(n, SharedSupply(12.0, 0.5, 1, flag)) for n in (1, 1)]), torques, speeds
+        )
         for flag in (True, False)
     ]
     battery, rectifier = (result[1] for result in signals)
