@@ -82,7 +82,7 @@ class MotorStep(NamedTuple):
 class Piece(NamedTuple):
     """Part of a mechanical step in which a motor's speed is held, as in `shaft.advance_motor`."""
 
-    count: float
+    num_samples: float
     """Number of its samples."""
     speed: float
     """Speed [rad/s] of the rotor."""
@@ -180,7 +180,7 @@ def begin_step(
     return (
         step,
         piece,
-        Sampled(winding.current, integral, winding.pending, piece.count, 0.0, 0.0, 0.0),
+        Sampled(winding.current, integral, winding.pending, piece.num_samples, 0.0, 0.0, 0.0),
     )
 
 
@@ -245,7 +245,7 @@ def advance_sample(
         )
         if piece.pieces_left > 0.0:
             piece = _next_piece(piece.pieces_left, piece.samples_left, speed, current)
-        countdown, total, drawn = piece.count, 0.0, 0.0
+        countdown, total, drawn = piece.num_samples, 0.0, 0.0
     after = Sampled(current, integral, pending, countdown, total, drawn, saturated)
     return piece, after, averages, duty * mean
 
@@ -261,13 +261,13 @@ def _end_piece(
     drawn: float,
 ) -> tuple[StepAverages, float]:
     """Return the averages with those of a piece that ends, and the rotor's new speed [rad/s]."""
-    share = piece.count / step.samples
+    share = piece.num_samples / step.samples
     mean, voltage, power, heat = shaft.winding_means(
         step.resistance,
         step.x,
         -math.expm1(-step.x),
         parameters.back_emf_constant * piece.speed,
-        piece.count,
+        piece.num_samples,
         piece.initial_current,
         current,
         total,

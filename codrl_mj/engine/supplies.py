@@ -8,13 +8,15 @@ models with a shared supply.
 
 import functools
 import math
-from typing import NamedTuple
+from types import FunctionType
+from typing import NamedTuple, cast
 
 import numpy as np
 from numba import types
 
 from codrl_mj.actuators import SharedDrive, SharedVoltageDrive, family_id
 from codrl_mj.actuators import shared_drive as equations
+from codrl_mj.actuators.drive import State
 from codrl_mj.actuators.model import Inputs
 from codrl_mj.actuators.parameters import parameters_type
 from codrl_mj.actuators.shaft import StepAverages
@@ -59,7 +61,7 @@ ROW_SIZE = len(Row._fields)
 _PARAMETERS = parameters_type(SharedDrive)
 _NUMBER = _PARAMETERS._fields.index("supply_number")
 _CLOSED, _OPEN = family_id(SharedDrive), family_id(SharedVoltageDrive)
-_NUM_STATES = len(equations.State._fields)
+_NUM_STATES = len(State._fields)
 
 _PARTS = (equations.MotorStep, equations.Piece, equations.Sampled, StepAverages)
 _OFFSETS = tuple(8 * sum(len(part._fields) for part in _PARTS[:n]) for n in range(len(_PARTS)))
@@ -181,13 +183,13 @@ def load_supplies() -> CompiledCallback[[int, int, float], float]:
         equations.end_step,
         equations.source_current,
     ):
-        register_callees(function)
+        register_callees(cast(FunctionType, function))
     begin_step, want_voltage = internal(equations.begin_step), internal(equations.want_voltage)
     advance_sample, end_step = internal(equations.advance_sample), internal(equations.end_step)
     source_current = internal(equations.source_current)
     step_type, piece_type, sampled_type, averages_type = _PARTS
     piece_at, sampled_at, averages_at = _OFFSETS[1:]
-    parameters_of, state_of, num_states = _PARAMETERS, equations.State, _NUM_STATES
+    parameters_of, state_of, num_states = _PARAMETERS, State, _NUM_STATES
 
     @internal
     def inputs_of(row: int) -> Inputs:
