@@ -57,6 +57,12 @@ from codrl_mj.actuators.pwm_servo import PwmServo
 from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
 from codrl_mj.actuators.servo_friction import ServoFriction
+from codrl_mj.actuators.shared_drive import (
+    SharedDrive,
+    SharedSupply,
+    SharedVoltageDrive,
+    check_supplies,
+)
 from codrl_mj.actuators.stability import check_stable, spectral_radii, spectral_radius
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 from codrl_mj.user_code import allow_imports
@@ -87,6 +93,9 @@ __all__ = [
     "Servo",
     "ServoFriction",
     "ServoLoop",
+    "SharedDrive",
+    "SharedSupply",
+    "SharedVoltageDrive",
     "Supply",
     "TorqueSpeed",
     "UnstableError",
@@ -96,6 +105,7 @@ __all__ = [
     "override_actuator",
     "check_same_family",
     "check_stable",
+    "check_supplies",
     "electrical_step",
     "family_name",
     "family_id",

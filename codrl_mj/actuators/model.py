@@ -136,6 +136,8 @@ class ActuatorModel(fields.Checked):
     INERTIA: ClassVar[bool] = False
     """True if `advance` needs the inertia at the shaft. The engine takes some time to compute it.
     """
+    SHARES_SUPPLY: ClassVar[bool] = False
+    """True if the engine advances all actuators of a supply together; see `shared_drive`."""
     MOTION: ClassVar[bool] = False
     """True if the command is a position [rad] or a speed [rad/s] of the shaft instead of a torque.
     """

@@ -163,26 +163,73 @@ def run_samples(
     tracking = ki / gain if gain > 0.0 else 0.0
     voltage = parameters.supply_voltage
     sag = parameters.supply_resistance
-    deadband = parameters.deadband
     for _ in range(samples):
         limit = max(voltage - sag * abs(current), 0.0) if sag > 0.0 else voltage
         error = reference - current
         command = gain * error + integral + compensated
-        applied = min(max(command, -limit), limit)
-        # The three modes are back-calculation, clamping (1) and none (2).
-        if parameters.anti_windup == 0.0:
-            integral += ki * error + tracking * (applied - command)
-        elif (
-            parameters.anti_windup == 2.0 or applied == command or (command - applied) * error < 0.0
-        ):
-            integral += ki * error
-        saturated += applied != command
-        if parameters.delayed != 0.0:
-            applied, pending = min(max(pending, -limit), limit), applied
-        if deadband > 0.0:
-            applied = math.copysign(max(abs(applied) - deadband, 0.0), applied)
         total += current
-        final = (applied - back_emf) / resistance
-        drawn += final * (final + (current - final) * mean_decay)
-        current = final + (current - final) * decay
+        current, integral, pending, _, _, drawn_now, limited = advance_sample(
+            parameters,
+            current,
+            integral,
+            pending,
+            error,
+            command,
+            limit,
+            back_emf,
+            resistance,
+            decay,
+            mean_decay,
+            ki,
+            tracking,
+        )
+        drawn, saturated = drawn + drawn_now, saturated + limited
     return current, integral, pending, total, drawn, saturated
+
+
+def advance_sample(
+    parameters: Parameters,
+    current: float,
+    integral: float,
+    pending: float,
+    error: float,
+    command: float,
+    limit: float,
+    back_emf: float,
+    resistance: float,
+    decay: float,
+    mean_decay: float,
+    ki: float,
+    tracking: float,
+) -> tuple[float, float, float, float, float, float, int]:
+    """Advance a PI loop by one sample, from the voltage that it commands and the voltage limit.
+
+    `error` is the error of the current [A], and `tracking` the gain of the back-calculation. The
+    other arguments are those of `run_samples`.
+
+    The result is i [A], the integral [V], the pending voltage [V], the applied voltage [V], the
+    mean current [A] of the sample, the drawn power over the resistance [A^2], and 1 if the voltage
+    is saturated.
+    """
+    applied = min(max(command, -limit), limit)
+    # The three modes are back-calculation, clamping (1) and none (2).
+    if parameters.anti_windup == 0.0:
+        integral += ki * error + tracking * (applied - command)
+    elif parameters.anti_windup == 2.0 or applied == command or (command - applied) * error < 0.0:
+        integral += ki * error
+    saturated = applied != command
+    if parameters.delayed != 0.0:
+        applied, pending = min(max(pending, -limit), limit), applied
+    if parameters.deadband > 0.0:
+        applied = math.copysign(max(abs(applied) - parameters.deadband, 0.0), applied)
+    final = (applied - back_emf) / resistance
+    mean = final + (current - final) * mean_decay
+    return (
+        final + (current - final) * decay,
+        integral,
+        pending,
+        applied,
+        mean,
+        final * mean,
+        1 if saturated else 0,
+    )

@@ -291,12 +291,44 @@ def advance_winding(
             ki,
         )
         after = Winding(current, integral, pending)
-    change = (after.current - winding.current) / drop
+    mean, volts, power, heat = winding_means(
+        *(resistance, x, drop, back_emf, samples, winding.current, after.current, total, drawn)
+    )
+    return after, mean, volts, saturated, power, heat
+
+
+def winding_means(
+    resistance: float,
+    x: float,
+    drop: float,
+    back_emf: float,
+    samples: float,
+    initial_current: float,
+    current: float,
+    total: float,
+    drawn: float,
+) -> tuple[float, float, float, float]:
+    """Return means over some samples: current [A], voltage [V], power [W] and heat [W].
+
+    The formulas are those of `advance_winding`; `total` and `drawn` are the sums that
+    `sampled.run_samples` returns.
+    """
+    change = (current - initial_current) / drop
     mean = (total + (1.0 - drop / x) * change) / samples
-    stored = (after.current - winding.current) * (after.current + winding.current) / (2.0 * x)
+    stored = (current - initial_current) * (current + initial_current) / (2.0 * x)
     scale = resistance / samples
     power, heat = back_emf * mean + scale * drawn, scale * (drawn - stored)
-    return after, mean, back_emf + resistance * (total + change) / samples, saturated, power, heat
+    return mean, back_emf + resistance * (total + change) / samples, power, heat
+
+
+def pieces_of_step(
+    parameters: Parameters, resistance: float, duration: float, samples: int, inertia: float
+) -> int:
+    """Return the number of pieces, with a speed each, into which `advance_motor` divides time."""
+    braking = parameters.torque_constant * parameters.back_emf_constant / resistance
+    braking += parameters.viscous_friction
+    braking += parameters.friction_viscous / (parameters.gear_ratio * parameters.gear_ratio)
+    return min(max(math.ceil(2.0 * duration * braking / inertia), 1), samples)
 
 
 def advance_motor(
@@ -320,12 +352,7 @@ def advance_motor(
     # Viscous friction belongs to the joint, and `external_acceleration` includes it at the initial
     # speed. So only the change since then is added.
     viscous = parameters.viscous_friction
-    braking = (
-        parameters.torque_constant * parameters.back_emf_constant / resistance
-        + viscous
-        + parameters.friction_viscous / (parameters.gear_ratio * parameters.gear_ratio)
-    )
-    pieces = min(max(math.ceil(2.0 * duration * braking / shaft.inertia), 1), samples)
+    pieces = pieces_of_step(parameters, resistance, duration, samples, shaft.inertia)
     has_losses = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
     is_servo = has_servo_friction(parameters)
     amperes, volts, torque, power, heat = 0.0, 0.0, 0.0, 0.0, 0.0

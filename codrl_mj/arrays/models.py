@@ -83,7 +83,8 @@ def prepare_model(
 
     Raises:
         ValueError: see `codrl_mj.add_motors`; or an actuator has a kind that the adapters refuse:
-            it drives no joint, has activation dynamics, or shares its motor.
+            it drives no joint, has activation dynamics, or shares its motor; or a motor shares
+            its supply.
     """
     check_joint_dynamics(joint_dynamics)
     spec = _read_spec(model)
@@ -137,6 +138,11 @@ def _check_kinds(spec: mujoco.MjSpec, model: mujoco.MjModel, added: Sequence[Add
             raise ValueError(
                 f"{motor.pattern!r}: several actuators cannot share a motor in another simulator:"
                 " drive the joint by one actuator"
+            )
+        if motor.actuator.SHARES_SUPPLY:
+            raise ValueError(
+                f"{description}: its motor is a {type(motor.actuator).__name__}, whose supply no"
+                " other simulator shares among motors: use the family drive, or add_motors"
             )
         if reason := _refused_kind(model, index):
             raise ValueError(f"{description}: cannot have a motor in another simulator: {reason}")

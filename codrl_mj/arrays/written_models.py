@@ -274,6 +274,11 @@ def _complete(actuator: ActuatorModel, target: str) -> Drive:
     """
     if not isinstance(actuator, Drive):
         raise ValueError(f"actuator = {type(actuator).__name__}: {target} needs a Drive")
+    if actuator.SHARES_SUPPLY:
+        raise ValueError(
+            f"actuator = {type(actuator).__name__}: {target} has no supply that motors share; use"
+            " the family drive"
+        )
     missing = {
         "motor.back_emf_constant = 0: the motor has no no-load speed": (
             actuator.motor.back_emf_constant == 0.0

@@ -18,6 +18,7 @@ from codrl_mj.engine.families import (
     INERTIA,
     PARAMETERS,
     SIGNATURE,
+    SLOT_HEADER_SIZE,
     SLOT_SIZE,
     USER_HEADER_SIZE,
     advance_slot,
@@ -27,8 +28,22 @@ from codrl_mj.engine.families import (
 )
 from codrl_mj.engine.hill import hill_callbacks
 from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.memory import CFunction, callback, entry_address, f64, internal
+from codrl_mj.engine.memory import (
+    CFunction,
+    callback,
+    entry_address,
+    f64,
+    internal,
+    stack_floats,
+)
 from codrl_mj.engine.model_access import command, is_disabled, output_inertia, user_address
+from codrl_mj.engine.supplies import (
+    ROW_SIZE,
+    advance_supply,
+    shares_supply,
+    supply_number,
+    write_row,
+)
 
 _USER_DYNAMICS, _USER_BIAS = int(mujoco.mjtDyn.mjDYN_USER), int(mujoco.mjtBias.mjBIAS_USER)
 _FIRST, _SECOND = SIGNATURE
@@ -57,6 +72,50 @@ def _is_ours(model: int, actuator: int) -> bool:
     )
 
 
+@internal(inline="always")
+def _is_on_supply(model: int, actuator: int, number: float) -> bool:
+    """Return True if an enabled actuator of ours is on the supply of a number."""
+    if not _is_ours(model, actuator) or is_disabled(model, actuator):
+        return False
+    user = user_address(model, actuator)
+    return shares_supply(int(f64(user)[2])) and supply_number(user + 8 * USER_HEADER_SIZE) == number
+
+
+@internal
+def _advance_supply_of(model: int, data: int, first: int) -> None:
+    """Advance all actuators of a supply, unless an actuator before `first` has done so."""
+    time, count = DATA.time(data), 0
+    number = supply_number(user_address(model, first) + 8 * USER_HEADER_SIZE)
+    for actuator in range(first):
+        if _is_on_supply(model, actuator, number):
+            return
+    for actuator in range(first, MODEL.nactuator(model)):
+        count += _is_on_supply(model, actuator, number)
+    rows = entry_address(stack_floats(ROW_SIZE * count), 0)
+    row = rows
+    for actuator in range(first, MODEL.nactuator(model)):
+        if not _is_on_supply(model, actuator, number):
+            continue
+        user, slot = user_address(model, actuator), _slot_of(model, data, actuator)
+        family_number, out = int(f64(user)[2]), MODEL.actuator_outadr(model)[actuator]
+        if f64(slot)[0] != time:
+            commit_slot(family_number, slot, time)
+        write_row(
+            row,
+            family_number,
+            user + 8 * USER_HEADER_SIZE,
+            slot,
+            slot + 8 * SLOT_HEADER_SIZE,
+            command(model, data, actuator),
+            DATA.actuator_length(data)[out],
+            DATA.actuator_velocity(data)[out],
+            time,
+            output_inertia(model, data, out, 1.0),
+        )
+        row += 8 * ROW_SIZE
+    advance_supply(rows, count, MODEL.opt.timestep(model))
+
+
 @functools.cache
 def motor_callbacks() -> dict[str, CFunction]:
     """Return the motors' callbacks by MuJoCo's names, in the form that its setters accept.
@@ -81,6 +140,9 @@ def motor_callbacks() -> dict[str, CFunction]:
                 continue
             user, slot = user_address(model, actuator), _slot_of(model, data, actuator)
             family_number = int(f64(user)[2])
+            if shares_supply(family_number):
+                _advance_supply_of(model, data, actuator)
+                continue
             # The engine may call this several times at one time (mj_forward, then mj_step). The
             # candidate state becomes the state only after time has advanced.
             if time != f64(slot)[0]:

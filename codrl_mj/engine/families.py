@@ -8,15 +8,13 @@ second.
 import contextlib
 import ctypes
 import functools
-import sys
 from collections.abc import Callable, Iterator
-from types import CodeType, FunctionType, ModuleType
+from types import FunctionType
 from typing import NamedTuple, cast
 
 import numpy as np
 from numba import types
 from numba.core.dispatcher import Dispatcher
-from numba.extending import register_jitable
 from numpy.typing import ArrayLike
 
 from codrl_mj.actuators import Family, Inputs, family_id, import_path, parameters_type
@@ -30,11 +28,13 @@ from codrl_mj.engine.memory import (
     named_address,
     named_tuple_type,
     read,
+    register_callees,
     u8,
     u64,
     write,
 )
 from codrl_mj.engine.model_access import load_inertia
+from codrl_mj.engine.supplies import load_supplies
 from codrl_mj.user_code import Form, UserFunction, check_form, compile_error_message
 
 SIGNATURE = (250700.0, 268401.0)
@@ -140,6 +140,8 @@ def load_family(family: Family) -> None:
         )
     if family.INERTIA:
         load_inertia()
+    if family.SHARES_SUPPLY:
+        load_supplies()
     function, text = _compile(family), ctypes.create_string_buffer(import_path(family).encode())
     _SIZES[family_number], _IMPORT_PATHS[family_number] = (
         (*sizes, slot_size(family)),
@@ -173,40 +175,6 @@ def family_replaced(family: Family, replacement: Family) -> Iterator[None]:
         _ADDRESSES[family_number] = original
 
 
-_LIBRARIES = sys.stdlib_module_names | {"numba", "numpy", "scipy"}
-"""Packages whose functions numba supports by itself, or not at all."""
-
-_REGISTERED: set[FunctionType] = set()
-"""Plain functions that compiled code can call."""
-
-
-def _register_callees(function: FunctionType) -> None:
-    """Register the Python functions that a function calls, directly or indirectly, with numba.
-
-    They can still be called from Python.
-    """
-    # Nested functions and comprehensions have code objects of their own, among the constants.
-    codes, names = [function.__code__], set[str]()
-    for code in codes:
-        names |= {*code.co_names, *code.co_freevars}
-        codes += [const for const in code.co_consts if isinstance(const, CodeType)]
-    closure = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-    scope = function.__globals__ | {name: cell.cell_contents for name, cell in closure}
-    values = [scope[name] for name in names & scope.keys()]
-    # The loop appends functions that are called through a module (`module.f(x)`) to the list.
-    for value in values:
-        if isinstance(value, ModuleType) and value.__name__.partition(".")[0] not in _LIBRARIES:
-            inner = [getattr(value, name) for name in names if hasattr(value, name)]
-            values += [callee for callee in inner if all(callee is not known for known in values)]
-        is_user_function = (
-            isinstance(value, FunctionType) and value.__module__.partition(".")[0] not in _LIBRARIES
-        )
-        if is_user_function and value not in _REGISTERED:
-            _REGISTERED.add(value)
-            register_jitable(forceinline=True)(value)
-            _register_callees(value)
-
-
 @functools.cache
 def compiled_function(
     function: UserFunction, form: Form, declared: str, *argument_types: types.Type
@@ -221,7 +189,7 @@ def compiled_function(
         VerifiedMarker("fits", function, form, argument_types),
     )
     try:
-        _register_callees(cast(FunctionType, function))
+        register_callees(cast(FunctionType, function))
         if marker.exists():
             return compiled
         dispatcher.compile(argument_types)

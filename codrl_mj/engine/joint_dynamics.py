@@ -124,12 +124,17 @@ def describe_bypasses(model: mujoco.MjModel, added: Sequence[AddedMotor]) -> lis
                 " passes through no motor; remove it from the model, and command it at actuator"
                 f" {names[first]}"
             )
-    supplies = {names[motor.indices[0]]: getattr(motor.actuator, "supply", None) for motor in added}
+    supplies = {
+        names[motor.indices[0]]: getattr(motor.actuator, "supply", None)
+        for motor in added
+        if not motor.actuator.SHARES_SUPPLY
+    }
     sagging = [name for name, supply in supplies.items() if getattr(supply, "resistance", 0.0)]
     if len(sagging) > 1:
         texts.append(
             f"supply.resistance: each of the motors {', '.join(sagging)} has a separate supply: on"
-            " one battery the current of each would lower the voltage of all"
+            " one battery the current of each would lower the voltage of all, as it does with the"
+            " family shared_drive"
         )
     return texts
 

@@ -5,8 +5,10 @@
 import ctypes
 import functools
 import inspect
+import sys
 from collections import namedtuple
 from collections.abc import Callable, Sequence
+from types import CodeType, FunctionType, ModuleType
 from typing import Protocol, TypeVar, overload
 
 import numba
@@ -17,7 +19,7 @@ from numba import types
 from numba.core import typing
 from numba.core.base import BaseContext
 from numba.core.typing import Signature
-from numba.extending import intrinsic
+from numba.extending import intrinsic, register_jitable
 
 from codrl_mj.compile_cache import CompiledCallback, F, P, R, register_symbol
 
@@ -46,6 +48,40 @@ def internal(function: F | None = None, **options: object) -> F | Callable[[F], 
         **options,
     )
     return compiled
+
+
+_LIBRARIES = sys.stdlib_module_names | {"numba", "numpy", "scipy"}
+"""Packages whose functions numba supports by itself, or not at all."""
+
+_REGISTERED: set[FunctionType] = set()
+"""Plain functions that compiled code can call."""
+
+
+def register_callees(function: FunctionType) -> None:
+    """Register the Python functions that a function calls, directly or indirectly, with numba.
+
+    They can still be called from Python.
+    """
+    # Nested functions and comprehensions have code objects of their own, among the constants.
+    codes, names = [function.__code__], set[str]()
+    for code in codes:
+        names |= {*code.co_names, *code.co_freevars}
+        codes += [const for const in code.co_consts if isinstance(const, CodeType)]
+    closure = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    scope = function.__globals__ | {name: cell.cell_contents for name, cell in closure}
+    values = [scope[name] for name in names & scope.keys()]
+    # The loop appends functions that are called through a module (`module.f(x)`) to the list.
+    for value in values:
+        if isinstance(value, ModuleType) and value.__name__.partition(".")[0] not in _LIBRARIES:
+            inner = [getattr(value, name) for name in names if hasattr(value, name)]
+            values += [callee for callee in inner if all(callee is not known for known in values)]
+        is_user_function = (
+            isinstance(value, FunctionType) and value.__module__.partition(".")[0] not in _LIBRARIES
+        )
+        if is_user_function and value not in _REGISTERED:
+            _REGISTERED.add(value)
+            register_jitable(forceinline=True)(value)
+            register_callees(value)
 
 
 class Pointer(Protocol[Number]):

@@ -24,6 +24,7 @@ from codrl_mj.engine.families import (
     MOTION,
     PARAMETERS,
     SIGNATURE,
+    SLOT_HEADER_SIZE,
     SLOT_SIZE,
     USER_HEADER_SIZE,
     advance_slot,
@@ -36,8 +37,15 @@ from codrl_mj.engine.families import (
     slot_size,
 )
 from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.memory import entry_address, f64, internal, named_address
+from codrl_mj.engine.memory import entry_address, f64, internal, named_address, stack_floats
 from codrl_mj.engine.model_access import clip, command, is_disabled, output_inertia, user_address
+from codrl_mj.engine.supplies import (
+    ROW_SIZE,
+    advance_supply,
+    shares_supply,
+    supply_number,
+    write_row,
+)
 from codrl_mj.plugin import FAMILY, NAME, library, log_warning, registered_plugins
 
 PLUGIN_HEADER_SIZE = USER_HEADER_SIZE + 1
@@ -183,6 +191,91 @@ def _find_fault(model: int, instance: int) -> int:
     return 1 if num_motors == 0 else 0 if num_motors == 1 else 6
 
 
+@internal(inline="always")
+def _is_held(model: int, data: int, family_number: int, slot: int) -> bool:
+    """Return True in stages 2 to 4 of RK4.
+
+    There the torque is held, because a drive is sampled once per step.
+    """
+    states, time = f64(slot), DATA.time(data)
+    flag = states[family_size(family_number, SLOT_SIZE) + 1]
+    is_in_step = states[0] < time <= states[0] + MODEL.opt.timestep(model) and flag != 0.0
+    return is_in_step and MODEL.opt.integrator(model) == _RK4 and family_number != _IDEAL
+
+
+@internal(inline="always")
+def _begin(model: int, data: int, actuator: int, slot: int) -> tuple[float, float]:
+    """Begin a motor's step: return desired torque [N*m] and inertia [kg*m^2] at the shaft."""
+    user, out = user_address(model, actuator), MODEL.actuator_outadr(model)[actuator]
+    family_number, arm = int(f64(user)[2]), f64(user)[USER_HEADER_SIZE]
+    # The callback backend multiplies by the gear 1/arm. A division by the arm would differ from it
+    # in the last bits.
+    gear, states = 1.0 / arm, f64(slot)
+    slot_end, force = family_size(family_number, SLOT_SIZE), 0.0
+    # The user may have changed the time since the state was committed.
+    states[0] = DATA.time(data)
+    if family_size(family_number, MOTION):
+        desired = command(model, data, actuator) * gear
+    else:
+        length, velocity = DATA.actuator_length(data)[out], DATA.actuator_velocity(data)[out]
+        force = _desired_force(model, data, actuator, length, velocity)
+        desired = force * arm
+    states[slot_end], states[slot_end + 1] = force, 1.0
+    if family_size(family_number, INERTIA):
+        return desired, output_inertia(model, data, out, gear)
+    return desired, math.inf
+
+
+@internal(inline="always")
+def _is_on_supply(model: int, actuator: int, number: float) -> bool:
+    """Return True if an enabled motor of ours is on the supply of a number."""
+    instance = MODEL.actuator_plugin(model)[actuator]
+    if instance < 0 or not _is_motor(model, actuator, instance) or is_disabled(model, actuator):
+        return False
+    user = user_address(model, actuator)
+    return (
+        shares_supply(int(f64(user)[2])) and supply_number(user + 8 * PLUGIN_HEADER_SIZE) == number
+    )
+
+
+@internal
+def _advance_supply_of(model: int, data: int, motor: int) -> None:
+    """Advance all motors of a supply if `motor` is the one whose instance MuJoCo computes first."""
+    number = supply_number(user_address(model, motor) + 8 * PLUGIN_HEADER_SIZE)
+    instances, count = MODEL.actuator_plugin(model), 0
+    slot = _slot_of(model, data, instances[motor])
+    for actuator in range(MODEL.nactuator(model)):
+        if _is_on_supply(model, actuator, number):
+            if instances[actuator] < instances[motor]:
+                return
+            count += 1
+    if _is_held(model, data, int(f64(user_address(model, motor))[2]), slot):
+        return
+    rows = entry_address(stack_floats(ROW_SIZE * count), 0)
+    row = rows
+    # The order is that of the actuators, as in the callback backend.
+    for actuator in range(MODEL.nactuator(model)):
+        if not _is_on_supply(model, actuator, number):
+            continue
+        user, out = user_address(model, actuator), MODEL.actuator_outadr(model)[actuator]
+        slot, gear = _slot_of(model, data, instances[actuator]), 1.0 / f64(user)[USER_HEADER_SIZE]
+        desired, inertia = _begin(model, data, actuator, slot)
+        write_row(
+            row,
+            int(f64(user)[2]),
+            user + 8 * PLUGIN_HEADER_SIZE,
+            slot,
+            slot + 8 * SLOT_HEADER_SIZE,
+            desired,
+            DATA.actuator_length(data)[out] * gear,
+            DATA.actuator_velocity(data)[out] * gear,
+            DATA.time(data),
+            inertia,
+        )
+        row += 8 * ROW_SIZE
+    advance_supply(rows, count, MODEL.opt.timestep(model))
+
+
 @functools.cache
 def compiled_entries() -> dict[str, CompiledCallback[..., int | None]]:
     """Return the plugin's functions by their names in `mjpPlugin`, compiled on first use.
@@ -204,38 +297,20 @@ def compiled_entries() -> dict[str, CompiledCallback[..., int | None]]:
             if not _is_motor(model, actuator, instance) or is_disabled(model, actuator):
                 continue
             user, out = user_address(model, actuator), MODEL.actuator_outadr(model)[actuator]
-            family_number, arm = int(f64(user)[2]), f64(user)[USER_HEADER_SIZE]
-            slot_end = family_size(family_number, SLOT_SIZE)
-            # The callback backend multiplies by the gear 1/arm. A division by the arm would differ
-            # from it in the last bits.
-            gear = 1.0 / arm
-            # In stages 2 to 4 of RK4 the torque is held, because a drive is sampled once per step.
-            is_in_step = states[0] < time <= states[0] + timestep and states[slot_end + 1] != 0.0
-            is_held = is_in_step and MODEL.opt.integrator(model) == _RK4 and family_number != _IDEAL
-            if not is_held:
+            family_number = int(f64(user)[2])
+            gear = 1.0 / f64(user)[USER_HEADER_SIZE]
+            if shares_supply(family_number):
+                _advance_supply_of(model, data, actuator)
+            elif not _is_held(model, data, family_number, slot):
+                desired, inertia = _begin(model, data, actuator, slot)
                 length = DATA.actuator_length(data)[out]
                 velocity = DATA.actuator_velocity(data)[out]
-                # The user may have changed the time since the state was committed.
-                states[0] = time
-                is_motion, force = family_size(family_number, MOTION) != 0, 0.0
-                if is_motion:
-                    desired = command(model, data, actuator) * gear
-                else:
-                    force = _desired_force(model, data, actuator, length, velocity)
-                    desired = force * arm
-                inertia = (
-                    output_inertia(model, data, out, gear)
-                    if family_size(family_number, INERTIA)
-                    else math.inf
-                )
                 advance_slot(
                     *(family_number, user + 8 * PLUGIN_HEADER_SIZE, timestep, slot, desired),
                     *(length * gear, velocity * gear, time, inertia),
                 )
-                states[slot_end], states[slot_end + 1] = (
-                    states[2] * gear if is_motion else force,
-                    1.0,
-                )
+                if family_size(family_number, MOTION):
+                    states[family_size(family_number, SLOT_SIZE)] = states[2] * gear
             DATA.actuator_force(data)[out] = states[2] * gear
 
     @cfunc(types.void(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")

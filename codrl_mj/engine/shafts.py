@@ -9,7 +9,14 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import BUILT_IN, ActuatorModel, Family, UnstableError, stability
+from codrl_mj.actuators import (
+    BUILT_IN,
+    ActuatorModel,
+    Family,
+    UnstableError,
+    check_supplies,
+    stability,
+)
 
 # Compiled and plain functions take the same arguments.
 AdvanceFunction = Callable[..., Any]
@@ -55,6 +62,15 @@ def check_shafts(
     }
     if not loop_actuators:
         return 0.0
+    names = [model.actuator(index).name or f"actuator {index}" for index in loop_actuators]
+    actuators_by_name = dict(zip(names, loop_actuators.values(), strict=True))
+    check_supplies(actuators_by_name, allow_unstable)
+    sharing = [name for name, motor in actuators_by_name.items() if motor.SHARES_SUPPLY]
+    if held and len(sharing) > 1:
+        raise ValueError(
+            f"{', '.join(sharing)}: motors that share a supply need physics = 'mujoco', because"
+            " physics = 'analytic' advances each motor by itself"
+        )
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
     joints = _joints(model, data, loop_actuators, arms, explicit)
@@ -62,7 +78,6 @@ def check_shafts(
     shafts = [
         (model.actuator_trntype[index], *model.actuator_trnid[index]) for index in loop_actuators
     ]
-    names = [model.actuator(index).name or f"actuator {index}" for index in loop_actuators]
     for actuator, inertia, shaft, name in zip(
         loop_actuators.values(), inertias, shafts, names, strict=True
     ):

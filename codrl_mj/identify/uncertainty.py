@@ -16,7 +16,7 @@ import numpy as np
 
 from codrl_mj.identify.estimate import Fit, Misfit, Model, fit_warnings, optimize
 from codrl_mj.identify.invariances import invariant_directions
-from codrl_mj.identify.log import BLOCK_DURATION, Log, halve_rate, has_motion, replace_signal
+from codrl_mj.identify.log import BLOCK_DURATION, Log, has_motion, replace_signal
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import (
     DEFAULTS,

@@ -19,6 +19,8 @@ from codrl_mj.actuators import (
     Lag,
     PwmServo,
     Servo,
+    SharedDrive,
+    SharedVoltageDrive,
     TorqueSpeed,
     VoltageDrive,
     VoltageDriven,
@@ -228,6 +230,14 @@ def drive_case(draw, family=Drive, timestep=0.002):
     return timestep, p, state, inputs, units
 
 
+def shared_drive_case(draw, family):
+    timestep, p, state, inputs, units = drive_case(draw, family)
+    p["deadband"] = np.zeros(draw.n)
+    p["supply_recharges"] = draw.sometimes(0.5, 1.0)
+    units["supply_voltage"], units["supply_current"] = units["voltage"], units["current"]
+    return timestep, p, state, inputs, units
+
+
 def servo_case(draw):
     n = draw.n
     timestep, p, state, inputs, units = drive_case(draw, Servo)
@@ -371,6 +381,11 @@ FAMILIES = {
     "voltage_driven": (VoltageDriven, lambda draw: current_loop_case(draw, VoltageDriven)),
     "drive": (Drive, drive_case),
     "voltage_drive": (VoltageDrive, lambda draw: drive_case(draw, VoltageDrive)),
+    "shared_drive": (SharedDrive, lambda draw: shared_drive_case(draw, SharedDrive)),
+    "shared_voltage_drive": (
+        SharedVoltageDrive,
+        lambda draw: shared_drive_case(draw, SharedVoltageDrive),
+    ),
     "servo": (Servo, servo_case),
     "pwm_servo": (PwmServo, pwm_servo_case),
     "lag": (Lag, lag_case),
