@@ -9,7 +9,7 @@ solution of
 
 It follows from the currents at that sample, and is held like the drives' voltages to the next one.
 All drives of a supply must therefore advance together, sample by sample: `begin_step`, then
-`request_voltage` and `advance_sample` for each sample, then `end_step`. The engine does this for the
+`request_voltage` and `advance_sample` for each sample, then `end_step`. The engine does so for the
 drives of a model whose supplies have the same number. `advance` does it for a single drive.
 """
 
@@ -477,8 +477,8 @@ def check_supplies(actuators: Mapping[str, ActuatorModel], allow_unstable: bool 
             ):
                 if value != expected:
                     raise ValueError(
-                        f"{name}: {field} = {value}: must be {expected} as for {first_name}, because"
-                        f" both are on supply {number}; or give it another supply.number"
+                        f"{name}: {field} = {value}: must be {expected} as for {first_name}: both"
+                        f" are on supply {number}; or give it another supply.number"
                     )
         smallest = _smallest_eigenvalue(list(members.values()))
         if smallest <= -1.0 and not allow_unstable:
