@@ -114,7 +114,7 @@ class Sampled(NamedTuple):
 
 
 def supply_voltage(parameters: Parameters, requested: float, current: float) -> float:
-    """Return the voltage [V] of a supply with one drive, from its requested voltage and its current.
+    """Return the voltage [V] of a supply with one drive, from the voltage that it requests.
 
     `engine.supplies` has the solution for several drives.
     """
