@@ -5,11 +5,11 @@ power: u*i = V*(duty*i). A drive that brakes takes a negative current, which fee
 the source's voltage E and resistance Rs the voltage V of the supply at a sample is the largest
 solution of
 
-    V = E - Rs*sum(u*i)/V,  u = min(max(wanted, -V), V).
+    V = E - Rs*sum(u*i)/V,  u = min(max(requested, -V), V).
 
 It follows from the currents at that sample, and is held like the drives' voltages to the next one.
 All drives of a supply must therefore advance together, sample by sample: `begin_step`, then
-`want_voltage` and `advance_sample` for each sample, then `end_step`. The engine does this for the
+`request_voltage` and `advance_sample` for each sample, then `end_step`. The engine does so for the
 drives of a model whose supplies have the same number. `advance` does it for a single drive.
 """
 
@@ -114,13 +114,13 @@ class Sampled(NamedTuple):
     """Number of saturated samples in the step."""
 
 
-def supply_voltage(parameters: Parameters, wanted: float, current: float) -> float:
-    """Return the voltage [V] of a supply with one drive, from its wanted voltage and its current.
+def supply_voltage(parameters: Parameters, requested: float, current: float) -> float:
+    """Return the voltage [V] of a supply with one drive, from the voltage that it requests.
 
     `engine.supplies` has the solution for several drives.
     """
     source, resistance = parameters.supply_voltage, parameters.supply_resistance
-    size, drawn = abs(wanted), current if wanted > 0.0 else -current
+    size, drawn = abs(requested), current if requested > 0.0 else -current
     # The drive is saturated, and passes the whole current on, unless V^2 - E*V + Rs*u*i = 0 has a
     # solution at which it is not.
     voltage = min(max(source - resistance * drawn, 0.0), size)
@@ -185,7 +185,7 @@ def begin_step(
     )
 
 
-def want_voltage(
+def request_voltage(
     parameters: Parameters, step: MotorStep, piece: Piece, motor: Sampled, closed: bool
 ) -> tuple[float, float]:
     """Return the voltages [V] that the loop commands and that the bridge would apply now.
@@ -210,7 +210,7 @@ def advance_sample(
     motor: Sampled,
     averages: StepAverages,
     command: float,
-    wanted: float,
+    requested: float,
     limit: float,
     closed: bool,
 ) -> tuple[Piece, Sampled, StepAverages, float]:
@@ -237,7 +237,7 @@ def advance_sample(
         step.ki / gain if gain > 0.0 else 0.0,
     )
     # At a voltage of 0 the supply is short-circuited by saturated bridges.
-    duty = applied / limit if limit > 0.0 else math.copysign(1.0, wanted)
+    duty = applied / limit if limit > 0.0 else math.copysign(1.0, requested)
     countdown, saturated = motor.countdown - 1.0, motor.saturated + limited
     total, drawn = motor.total + motor.current, motor.drawn + drawn
     if countdown == 0.0:
@@ -341,10 +341,10 @@ def _advance(
     volts, amperes = 0.0, 0.0
     samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
     for _ in range(samples):
-        command, wanted = want_voltage(parameters, step, piece, motor, closed)
-        limit = supply_voltage(parameters, wanted, motor.current)
+        command, requested = request_voltage(parameters, step, piece, motor, closed)
+        limit = supply_voltage(parameters, requested, motor.current)
         piece, motor, averages, supplied = advance_sample(
-            parameters, timestep, step, piece, motor, averages, command, wanted, limit, closed
+            parameters, timestep, step, piece, motor, averages, command, requested, limit, closed
         )
         volts, amperes = volts + limit, amperes + source_current(parameters, supplied)
     return end_step(
@@ -428,9 +428,9 @@ class SharedDrive(Drive):
     @classmethod
     def from_motor_parameters(cls, parameters: MotorParameters) -> "SharedDrive":
         """Return a drive for a motor, with its nominal voltage (or 24 V) and its peak current."""
-        own = Drive.from_motor_parameters(parameters)
-        supply = None if own.supply is None else SharedSupply(own.supply.voltage)
-        return cls(own.motor, own.controller, supply)
+        drive_alone = Drive.from_motor_parameters(parameters)
+        supply = None if drive_alone.supply is None else SharedSupply(drive_alone.supply.voltage)
+        return cls(drive_alone.motor, drive_alone.controller, supply)
 
     def commands(self) -> Mapping[str, Command]:
         """Return the commands of a drive."""
@@ -472,7 +472,7 @@ def check_supplies(actuators: Mapping[str, ActuatorModel], allow_unstable: bool 
         }
         first_name, first = next(iter(members.items()))
         for name, motor in members.items():
-            for field, value, other in (
+            for field, value, expected in (
                 *_differences(motor.shared_supply, first.shared_supply),
                 (
                     "controller.sample_rate",
@@ -480,10 +480,10 @@ def check_supplies(actuators: Mapping[str, ActuatorModel], allow_unstable: bool 
                     first.controller.sample_rate,
                 ),
             ):
-                if value != other:
+                if value != expected:
                     raise ValueError(
-                        f"{name}: {field} = {value}: must be {other} as for {first_name}, because"
-                        f" both are on supply {number}; or give it another supply.number"
+                        f"{name}: {field} = {value}: must be {expected} as for {first_name}: both"
+                        f" are on supply {number}; or give it another supply.number"
                     )
         smallest = _smallest_eigenvalue(list(members.values()))
         if smallest <= -1.0 and not allow_unstable:
@@ -496,11 +496,11 @@ def check_supplies(actuators: Mapping[str, ActuatorModel], allow_unstable: bool 
 
 
 def _differences(
-    supply: SharedSupply, other: SharedSupply
+    supply: SharedSupply, first: SharedSupply
 ) -> list[tuple[str, float | bool, float | bool]]:
-    """Return name, value and the other's value of all fields of a supply."""
+    """Return name, value and the first supply's value of all fields of a supply."""
     return [
-        (f"supply.{field.name}", getattr(supply, field.name), getattr(other, field.name))
+        (f"supply.{field.name}", getattr(supply, field.name), getattr(first, field.name))
         for field in dataclasses.fields(supply)
     ]
 

@@ -67,8 +67,8 @@ _PARTS = (equations.MotorStep, equations.Piece, equations.Sampled, StepAverages)
 _OFFSETS = tuple(8 * sum(len(part._fields) for part in _PARTS[:n]) for n in range(len(_PARTS)))
 _COMMAND = sum(len(part._fields) for part in _PARTS)
 """Offset of a drive's commanded voltage in its work array, after its parts."""
-_WANTED, _CURRENT, _IS_FREE = _COMMAND + 1, _COMMAND + 2, _COMMAND + 3
-"""Offsets of the wanted voltage, the current, and 1 while the drive counts as not saturated."""
+_REQUESTED, _CURRENT, _IS_FREE = _COMMAND + 1, _COMMAND + 2, _COMMAND + 3
+"""Offsets of the requested voltage, the current, and 1 while the drive counts as not saturated."""
 _WORK_SIZE = _COMMAND + 4
 """Number of float64 in the work array of a drive."""
 
@@ -128,14 +128,14 @@ def bus_voltage(
     resistance: float,
     recharges: bool,
 ) -> float:
-    """Return the voltage [V] of a supply at a sample, from wanted voltages and currents.
+    """Return the voltage [V] of a supply at a sample, from requested voltages and currents.
 
-    The largest solution of the equation in `shared_drive` is found from above: the drives are taken
+    The largest solution of the equation in `shared_drive` is found from above: the drives count
     as saturated one by one, in the order of the voltages that they want. With the current S of the
     saturated drives and the power P of the others, V^2 - (E - Rs*S)*V + Rs*P = 0.
 
     Args:
-        work: array with the entries `_WANTED`, `_CURRENT` and `_IS_FREE` for each drive.
+        work: array with the entries `_REQUESTED`, `_CURRENT` and `_IS_FREE` for each drive.
         size: number of entries per drive.
         count: number of drives.
         source: voltage [V] of the source.
@@ -151,20 +151,20 @@ def bus_voltage(
     for _ in range(count + 1):
         power, below, largest = 0.0, 0.0, -1
         for motor in range(count):
-            wanted = work[size * motor + _WANTED]
+            requested = work[size * motor + _REQUESTED]
             if work[size * motor + _IS_FREE] == 0.0:
                 continue
             drawn = work[size * motor + _CURRENT]
-            power += abs(wanted) * (drawn if wanted > 0.0 else -drawn)
-            if largest < 0 or abs(wanted) > below:
-                below, largest = abs(wanted), motor
+            power += abs(requested) * (drawn if requested > 0.0 else -drawn)
+            if largest < 0 or abs(requested) > below:
+                below, largest = abs(requested), motor
         available = source - resistance * saturated
         square = available * available - 4.0 * resistance * power
         voltage = 0.5 * (available + math.sqrt(max(square, 0.0)))
         if largest < 0 or (square >= 0.0 and voltage >= below):
             break
-        wanted, drawn = work[size * largest + _WANTED], work[size * largest + _CURRENT]
-        saturated += drawn if wanted > 0.0 else -drawn
+        requested, drawn = work[size * largest + _REQUESTED], work[size * largest + _CURRENT]
+        saturated += drawn if requested > 0.0 else -drawn
         work[size * largest + _IS_FREE], above = 0.0, below
     voltage = min(max(voltage, 0.0), above)
     return voltage if recharges else min(voltage, source)
@@ -178,13 +178,16 @@ def load_supplies() -> CompiledCallback[[int, int, float], float]:
     """
     for function in (
         equations.begin_step,
-        equations.want_voltage,
+        equations.request_voltage,
         equations.advance_sample,
         equations.end_step,
         equations.source_current,
     ):
         register_callees(cast(FunctionType, function))
-    begin_step, want_voltage = internal(equations.begin_step), internal(equations.want_voltage)
+    begin_step, request_voltage = (
+        internal(equations.begin_step),
+        internal(equations.request_voltage),
+    )
     advance_sample, end_step = internal(equations.advance_sample), internal(equations.end_step)
     source_current = internal(equations.source_current)
     step_type, piece_type, sampled_type, averages_type = _PARTS
@@ -221,7 +224,7 @@ def load_supplies() -> CompiledCallback[[int, int, float], float]:
             for motor in range(count):
                 row, parts = rows + 8 * ROW_SIZE * motor, work + 8 * _WORK_SIZE * motor
                 sampled = read(parts + sampled_at, sampled_type)
-                command, wanted = want_voltage(
+                command, requested = request_voltage(
                     read(u64(row)[1], parameters_of),
                     read(parts, step_type),
                     read(parts + piece_at, piece_type),
@@ -229,7 +232,7 @@ def load_supplies() -> CompiledCallback[[int, int, float], float]:
                     f64(row)[0] != 0.0,
                 )
                 memory[_WORK_SIZE * motor + _COMMAND] = command
-                memory[_WORK_SIZE * motor + _WANTED] = wanted
+                memory[_WORK_SIZE * motor + _REQUESTED] = requested
                 memory[_WORK_SIZE * motor + _CURRENT] = sampled.current
             voltage = bus_voltage(
                 *(memory, _WORK_SIZE, count, supply.supply_voltage, supply.supply_resistance),
@@ -238,7 +241,7 @@ def load_supplies() -> CompiledCallback[[int, int, float], float]:
             supplied = 0.0
             for motor in range(count):
                 row, parts = rows + 8 * ROW_SIZE * motor, work + 8 * _WORK_SIZE * motor
-                piece, sampled, averages, taken = advance_sample(
+                piece, sampled, averages, bridge_current = advance_sample(
                     read(u64(row)[1], parameters_of),
                     timestep,
                     read(parts, step_type),
@@ -246,14 +249,14 @@ def load_supplies() -> CompiledCallback[[int, int, float], float]:
                     read(parts + sampled_at, sampled_type),
                     read(parts + averages_at, averages_type),
                     memory[_WORK_SIZE * motor + _COMMAND],
-                    memory[_WORK_SIZE * motor + _WANTED],
+                    memory[_WORK_SIZE * motor + _REQUESTED],
                     voltage,
                     f64(row)[0] != 0.0,
                 )
                 write(piece, parts + piece_at)
                 write(sampled, parts + sampled_at)
                 write(averages, parts + averages_at)
-                supplied += taken
+                supplied += bridge_current
             volts, amperes = volts + voltage, amperes + source_current(supply, supplied)
         for motor in range(count):
             row, parts = rows + 8 * ROW_SIZE * motor, work + 8 * _WORK_SIZE * motor

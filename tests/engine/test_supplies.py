@@ -22,7 +22,7 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.engine.families import SLOT_HEADER_SIZE
 from codrl_mj.engine.specs import add_motors
-from codrl_mj.engine.supplies import _CURRENT, _WANTED, _WORK_SIZE, bus_voltage
+from codrl_mj.engine.supplies import _CURRENT, _REQUESTED, _WORK_SIZE, bus_voltage
 from tests.engine.models import add_motor
 
 SAMPLE_RATE, TIMESTEP = 20e3, 1e-3
@@ -73,11 +73,13 @@ def run(model, torques, speeds, steps=10):
     return data, {name: np.array([row[name] for row in table]) for name in table[0]}
 
 
-def voltage_by_search(source, resistance, wanted, currents):
+def voltage_by_search(source, resistance, requested, currents):
     """Return the largest solution of the supply's equation, by a search from above."""
 
     def excess(voltage):
-        powers = [np.clip(w, -voltage, voltage) * i for w, i in zip(wanted, currents, strict=True)]
+        powers = [
+            np.clip(w, -voltage, voltage) * i for w, i in zip(requested, currents, strict=True)
+        ]
         return source - resistance * sum(powers) / voltage - voltage
 
     grid = np.geomspace(source + resistance * np.abs(currents).sum() + 1.0, 1e-3, 20001)
@@ -160,14 +162,14 @@ def test_the_voltage_is_the_largest_solution_for_random_motors():
     kinds = set()
     for _ in range(100):
         count = int(random.integers(1, 6))
-        wanted, currents = random.normal(0.0, 10.0, count), random.normal(0.0, 8.0, count)
+        requested, currents = random.normal(0.0, 10.0, count), random.normal(0.0, 8.0, count)
         source, resistance = random.uniform(5.0, 20.0), random.uniform(0.01, 1.0)
         work = np.zeros(_WORK_SIZE * count)
-        work[_WANTED::_WORK_SIZE], work[_CURRENT::_WORK_SIZE] = wanted, currents
+        work[_REQUESTED::_WORK_SIZE], work[_CURRENT::_WORK_SIZE] = requested, currents
         voltage = bus_voltage.py_func(work, _WORK_SIZE, count, source, resistance, True)
-        expected = voltage_by_search(source, resistance, wanted, currents)
+        expected = voltage_by_search(source, resistance, requested, currents)
         assert voltage == pytest.approx(expected, rel=1e-9, abs=1e-9)
-        kinds |= {int((abs(wanted) > voltage).sum()), "rise" if voltage > source else "sag"}
+        kinds |= {int((abs(requested) > voltage).sum()), "rise" if voltage > source else "sag"}
         blocked = bus_voltage.py_func(work, _WORK_SIZE, count, source, resistance, False)
         assert blocked == min(voltage, source)
     assert {0, 1, 2, "rise", "sag"} <= kinds
@@ -185,9 +187,9 @@ def test_stalled_motors_share_the_current_of_one_source():
 
 
 def test_a_driving_motor_alone_has_the_bits_of_its_own_supply():
-    own, shared = motor_of(1, Supply(12.0, 0.5), Drive), motor_of(1, SharedSupply(12.0, 0.5))
+    single, shared = motor_of(1, Supply(12.0, 0.5), Drive), motor_of(1, SharedSupply(12.0, 0.5))
     for torque in (0.3, 2.0):
-        results = [run(wheels([motor]), torque, 20.0, steps=20)[1] for motor in (own, shared)]
+        results = [run(wheels([motor]), torque, 20.0, steps=20)[1] for motor in (single, shared)]
         for name in Drive.Signals._fields:
             np.testing.assert_array_equal(results[0][name], results[1][name], err_msg=name)
 
