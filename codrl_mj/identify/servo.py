@@ -298,7 +298,7 @@ def _fit(
             # The law with one more parameter has to be clearly better.
             if costs[1] < MAX_COST_RATIO * costs[0]:
                 fit, start_fits = other, (other,)
-            else:
+            elif costs[0] > MAX_COST_RATIO * costs[1]:
                 other_stall = other.model.all_values(other.values)["stall_torque"]
         unlimited = _without_limit(fit)
         # Friction that the model lacks looks like a limit, but explains little of the residuals.
