@@ -12,7 +12,6 @@ from codrl_mj.fields import check_names
 from codrl_mj.identify.duty_law import DutyLaw, fit_duty_law
 from codrl_mj.identify.estimate import (
     MAX_COST_RATIO,
-    MAX_MEAN_RESIDUAL,
     Fit,
     fit_from_starts,
     optimize,
@@ -291,8 +290,9 @@ def _fit(
     fit, start_fits = fit_from_starts(guessed, segments, starts, on_step)
     other_stall = math.nan
     if "stall_torque" in fit.model.names:
-        # With large residuals, another law would only imitate what the model lacks.
-        if np.mean(np.abs(np.concatenate(fit.residuals))) < MAX_MEAN_RESIDUAL:
+        # A servo with a register of its gain sets a duty. The other law has one more parameter, which
+        # would only imitate what the model of friction lacks.
+        if math.isnan(model.gain):
             alternative = _with_limited_torque(fit)
             costs = [float(candidate.costs(fit.scale).sum()) for candidate in (fit, alternative)]
             # The law with one more parameter has to be clearly better.
