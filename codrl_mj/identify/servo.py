@@ -290,8 +290,8 @@ def _fit(
     fit, start_fits = fit_from_starts(guessed, segments, starts, on_step)
     other_stall = math.nan
     if "stall_torque" in fit.model.names:
-        # A servo with a register of its gain sets a duty. The other law has one more parameter, which
-        # would only imitate what the model of friction lacks.
+        # A servo with a register of its gain sets a duty. The other law has one more parameter,
+        # which would only imitate what the model of friction lacks.
         if math.isnan(model.gain):
             alternative = _with_limited_torque(fit)
             costs = [float(candidate.costs(fit.scale).sum()) for candidate in (fit, alternative)]
