@@ -12,7 +12,6 @@ from codrl_mj.fields import check_names
 from codrl_mj.identify.duty_law import DutyLaw, fit_duty_law
 from codrl_mj.identify.estimate import (
     MAX_COST_RATIO,
-    MAX_MEAN_RESIDUAL,
     Fit,
     fit_from_starts,
     optimize,
@@ -291,18 +290,19 @@ def _fit(
     fit, start_fits = fit_from_starts(guessed, segments, starts, on_step)
     other_stall = math.nan
     if "stall_torque" in fit.model.names:
-        # With large residuals, another law would only imitate what the model lacks.
-        if np.mean(np.abs(np.concatenate(fit.residuals))) < MAX_MEAN_RESIDUAL:
-            other = _with_limited_torque(fit)
-            costs = [float(one.costs(fit.scale).sum()) for one in (fit, other)]
+        # A servo with a register of its gain sets a duty. The other law has one more parameter,
+        # which would only imitate what the model of friction lacks.
+        if math.isnan(model.gain):
+            alternative = _with_limited_torque(fit)
+            costs = [float(candidate.costs(fit.scale).sum()) for candidate in (fit, alternative)]
             # The law with one more parameter has to be clearly better.
             if costs[1] < MAX_COST_RATIO * costs[0]:
-                fit, start_fits = other, (other,)
-            else:
-                other_stall = other.model.all_values(other.values)["stall_torque"]
+                fit, start_fits = alternative, (alternative,)
+            elif costs[0] > MAX_COST_RATIO * costs[1]:
+                other_stall = alternative.model.all_values(alternative.values)["stall_torque"]
         unlimited = _without_limit(fit)
         # Friction that the model lacks looks like a limit, but explains little of the residuals.
-        costs = [float(one.costs(fit.scale).sum()) for one in (fit, unlimited)]
+        costs = [float(candidate.costs(fit.scale).sum()) for candidate in (fit, unlimited)]
         stall = fit.values[fit.model.names.index("stall_torque")]
         is_reached = largest_torque(fit.model, fit.values, segments, 1.0 - _LIMITED) > stall
         if not (is_reached and costs[0] < _MAX_LIMITED_COST * costs[1]):
@@ -328,7 +328,7 @@ def _with_limited_torque(fit: Fit[ServoModel]) -> Fit[ServoModel]:
         start[names.index("stall_torque")] = share * largest
         starts.append(start)
     fits = [optimize(model, fit.segments, start, 8, fit.scale) for start in starts]
-    best = min(fits, key=lambda one: one.costs(fit.scale).sum())
+    best = min(fits, key=lambda candidate: candidate.costs(fit.scale).sum())
     return optimize(model, fit.segments, best.values, 40, fit.scale, best.states)
 
 
@@ -407,7 +407,9 @@ def _with_other_law(estimate: Estimate, other: float, by_name: Mapping[str, Esti
 
 def _rms_speed(fit: Fit[ServoModel]) -> float:
     """Return the RMS of the speeds [rad/s] over the segments."""
-    speeds = [np.diff(one.measured[::20]) / np.diff(one.times[::20]) for one in fit.segments]
+    speeds = [
+        np.diff(segment.measured[::20]) / np.diff(segment.times[::20]) for segment in fit.segments
+    ]
     return float(np.sqrt(np.mean(np.concatenate(speeds) ** 2)))
 
 
@@ -497,11 +499,11 @@ def _derived(
             _ratio("duty_gain", gain, stall), why="if the duty at the limit is 1"
         )
     if stall is None:
-        least = largest_torque(fit.model, fit.values, fit.segments, 1.0)
+        reached = largest_torque(fit.model, fit.values, fit.segments, 1.0)
         derived["stall_torque"] = Estimate(
             "stall_torque",
-            least,
-            least,
+            reached,
+            reached,
             math.inf,
             "unidentifiable",
             "the torque reaches no limit, or too rarely: move faster or further, or log the duty",

@@ -61,8 +61,12 @@ class IdentifiedServo(Identified):
             if name in by_name and by_name[name].status not in USABLE
         ]
         if unusable:
-            texts = [f"{one.name} is {one.status}: {one.why}" for one in unusable]
-            names = " ".join(f"{one.name}=VALUE" for one in unusable if one.name != "duty_gain")
+            texts = [
+                f"{estimate.name} is {estimate.status}: {estimate.why}" for estimate in unusable
+            ]
+            names = " ".join(
+                f"{estimate.name}=VALUE" for estimate in unusable if estimate.name != "duty_gain"
+            )
             return f"{'; '.join(texts)}. Give --known {names}"
         if lacking:
             return f"{', '.join(lacking)}: the logs do not determine them"
