@@ -57,7 +57,7 @@ class Signals(NamedTuple):
     """Mean current [A] of the shared supply's source; negative while it is charged."""
 
 
-class MotorStep(NamedTuple):
+class StepConstants(NamedTuple):
     """Values of a motor that are constant in a mechanical step."""
 
     resistance: float
@@ -149,7 +149,7 @@ def begin_step(
     inputs: Inputs,
     closed: bool,
     sample_rate: float,
-) -> tuple[MotorStep, Piece, Sampled]:
+) -> tuple[StepConstants, Piece, Sampled]:
     """Return a motor at the beginning of a mechanical step.
 
     If the loop is `closed`, kT*A of desired torque stand for a current, else kT*V for a voltage.
@@ -172,7 +172,7 @@ def begin_step(
     pieces = shaft.pieces_of_step(parameters, resistance, timestep, samples, rotor.inertia)
     x = resistance * sample_time / parameters.inductance
     acceleration = rotor.external_acceleration
-    step = MotorStep(
+    step = StepConstants(
         *(resistance, command, rotor.inertia, acceleration, rotor.speed),
         *(kp, ki, x, float(samples)),
     )
@@ -186,7 +186,7 @@ def begin_step(
 
 
 def request_voltage(
-    parameters: Parameters, step: MotorStep, piece: Piece, motor: Sampled, closed: bool
+    parameters: Parameters, step: StepConstants, piece: Piece, motor: Sampled, closed: bool
 ) -> tuple[float, float]:
     """Return the voltages [V] that the loop commands and that the bridge would apply now.
 
@@ -205,7 +205,7 @@ def request_voltage(
 def advance_sample(
     parameters: Parameters,
     timestep: float,
-    step: MotorStep,
+    step: StepConstants,
     piece: Piece,
     motor: Sampled,
     averages: StepAverages,
@@ -254,7 +254,7 @@ def advance_sample(
 def _end_piece(
     parameters: Parameters,
     timestep: float,
-    step: MotorStep,
+    step: StepConstants,
     piece: Piece,
     averages: StepAverages,
     current: float,
@@ -297,7 +297,7 @@ def end_step(
     timestep: float,
     state: FamilyTuple,
     inputs: Inputs,
-    step: MotorStep,
+    step: StepConstants,
     motor: Sampled,
     averages: StepAverages,
     closed: bool,

@@ -63,7 +63,7 @@ _NUMBER = _PARAMETERS._fields.index("supply_number")
 _CLOSED, _OPEN = family_id(SharedDrive), family_id(SharedVoltageDrive)
 _NUM_STATES = len(State._fields)
 
-_PARTS = (equations.MotorStep, equations.Piece, equations.Sampled, StepAverages)
+_PARTS = (equations.StepConstants, equations.Piece, equations.Sampled, StepAverages)
 _OFFSETS = tuple(8 * sum(len(part._fields) for part in _PARTS[:n]) for n in range(len(_PARTS)))
 _COMMAND = sum(len(part._fields) for part in _PARTS)
 """Offset of a drive's commanded voltage in its work array, after its parts."""
