@@ -61,16 +61,19 @@ def _quotients(
         shaft.constant_torque,
         shaft.coulomb,
         shaft.stribeck_friction,
-        *([shaft.gain] if has_input else []),
     ]
+    inputs = model.input_quotients(values) if has_input else []
     # A gear's loss and Stribeck friction depend on the motor's torque, which back-EMF reduces and
     # viscous friction does not. Without them only the sum of both acts on the shaft.
     if fitted_shaft.gear_efficiency < 1.0 or fitted_shaft.stribeck_friction > 0.0:
-        torques += [shaft.viscous, shaft.braking]
+        damping = [shaft.viscous, shaft.braking]
     else:
-        torques.append(shaft.viscous + shaft.braking)
+        damping = [shaft.viscous + shaft.braking]
     dimensionless = [shaft.gear_efficiency, math.log(shaft.stribeck_speed)]
-    return np.array([*(torque / shaft.inertia for torque in torques), *dimensionless])
+    by_motion, by_speed = (
+        [torque / shaft.inertia for torque in group] for group in (torques, damping)
+    )
+    return np.array([*by_motion, *inputs, *by_speed, *dimensionless])
 
 
 def _null_space(matrix: np.ndarray) -> np.ndarray:

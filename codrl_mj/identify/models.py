@@ -200,6 +200,15 @@ class ShaftModel(Model):
             )
         return shaft_parameters(parameters, gain, braking)
 
+    def input_quotients(self, values: np.ndarray) -> list[float]:
+        """Return the numbers that tell how the input moves the shaft, from parameters (p,).
+
+        Two sets of parameters move the shaft alike if these numbers and the shaft's torques over
+        its inertia are equal.
+        """
+        shaft = self.shaft_parameters(values)
+        return [shaft.gain / shaft.inertia]
+
     def simulator(self, values: np.ndarray) -> Simulate:
         """Return a function that simulates the positions [rad] or speeds [rad/s] of a segment."""
         from codrl_mj.identify.simulation import simulate_shaft

@@ -109,6 +109,15 @@ class ServoModel(ShaftModel):
             float(self.limits_torque),
         )
 
+    def input_quotients(self, values: np.ndarray) -> list[float]:
+        """Return the numbers that tell how commands move the shaft, from free parameters (p,)."""
+        shaft, servo = self.shaft_parameters(values), self.servo_parameters(values)
+        torques = [servo.position_gain, servo.stall_torque]
+        # A limit of the torque applies to the damping, but not to the viscous friction.
+        torques += [shaft.viscous] if self.limits_torque else []
+        others = [servo.command_delay, servo.zero, self.all_values(values)["max_velocity"]]
+        return [torque / shaft.inertia for torque in torques] + others
+
     def simulator(self, values: np.ndarray) -> Simulate:
         """Return a function that simulates the positions [rad] of a segment."""
         shaft, servo = self.shaft_parameters(values), self.servo_parameters(values)
@@ -240,7 +249,10 @@ class ServoModel(ShaftModel):
 
         def error(values: np.ndarray) -> float:
             simulate = self.simulator(values)
-            errors = [np.abs(simulate(one, one.state) - one.measured).mean() for one in segments]
+            errors = [
+                np.abs(simulate(segment, segment.state) - segment.measured).mean()
+                for segment in segments
+            ]
             mean = float(np.mean(errors))
             return mean if math.isfinite(mean) else math.inf
 
