@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -34,22 +35,22 @@ class Servo:
     delay: float  # [s]
 
     @property
-    def load_inertia(self):
+    def load_inertia(self) -> float:
         """Inertia of the pendulum [kg*m^2]."""
         return self.mass * self.length**2
 
     @property
-    def mgl(self):
+    def mgl(self) -> float:
         """Largest torque of gravity [N*m]."""
         return self.mass * GRAVITY * self.length
 
     @property
-    def stall_torque(self):
+    def stall_torque(self) -> float:
         """Torque at full duty and standstill [N*m]."""
         return self.torque_constant / self.resistance * self.volts
 
     @property
-    def truth(self):
+    def truth(self) -> dict[str, float]:
         """True values of the parameters that a fit gives."""
         return {
             "position_gain": self.stall_torque * self.duty_gain,
@@ -63,12 +64,12 @@ class Servo:
         }
 
     @property
-    def known(self):
+    def known(self) -> dict[str, float]:
         """Parameters of the load, which a user has weighed and measured."""
         return {"mgl": self.mgl, "load_inertia": self.load_inertia}
 
 
-def draw(seed, kind="bam"):
+def draw(seed: int, kind: str = "bam") -> Servo:
     """Return a random servo: a motor of 0.3 to 4 N*m with a pendulum of a fifth to a half of it."""
     random = np.random.default_rng((seed, KINDS.index(kind)))
     stall, volts = (
@@ -95,7 +96,7 @@ def draw(seed, kind="bam"):
     )
 
 
-def commands(times, seed=0):
+def commands(times: np.ndarray, seed: int = 0) -> np.ndarray:
     """Return commands [rad]: a sweep, steps and sines, for a third of the time each."""
     random = np.random.default_rng((seed, 99))
     third = times[-1] / 3.0
@@ -107,17 +108,32 @@ def commands(times, seed=0):
     return np.select([times < third, times < 2.0 * third], [sweep, steps], sines)
 
 
-def _held(servo, seed, duration, rate):
-    """Return the times of the rows, and the held and delayed commands of the simulation's steps."""
+class _Commands(NamedTuple):
+    """Commands of a log of n rows, and of the m steps of its simulation."""
+
+    times: np.ndarray  # [s], shape (n,)
+    targets: np.ndarray  # [rad], shape (n,)
+    held: np.ndarray  # late by the delay, and held until the next row [rad], shape (m,)
+
+
+class Motion(NamedTuple):
+    """Motion of a simulated servo, at its m time steps."""
+
+    positions: np.ndarray  # [rad], shape (m,)
+    duties: np.ndarray  # from -1 to 1, shape (m,)
+
+
+def _held(servo: Servo, seed: int, duration: float, rate: float) -> _Commands:
+    """Return the commands of a log, and those that reach the servo at each step."""
     times = np.arange(round(duration * rate)) / rate
     targets = commands(times, seed)
     grid = STEP * np.arange(round(duration / STEP))
     rows = np.floor((grid - servo.delay) * rate + 1e-9).astype(int)
-    return times, targets, targets[np.clip(rows, 0, None)]
+    return _Commands(times, targets, targets[np.clip(rows, 0, None)])
 
 
-def simulate_bam(servo, targets):
-    """Return positions [rad] and duties by BAM's equations with its friction M1 or M3."""
+def simulate_bam(servo: Servo, targets: np.ndarray) -> Motion:
+    """Return the motion by BAM's equations with its friction M1 or M3."""
     position = speed = 0.0
     inertia = servo.load_inertia + servo.armature
     positions, duties = np.empty(len(targets)), np.empty(len(targets))
@@ -136,11 +152,11 @@ def simulate_bam(servo, targets):
         acceleration = net / inertia
         speed += acceleration * STEP
         position += speed * STEP + 0.5 * acceleration * STEP**2
-    return positions, duties
+    return Motion(positions, duties)
 
 
-def simulate_pwm(servo, targets, period=2e-3, bits=10):
-    """Return positions and duties of a servo whose firmware runs every 2 ms with a PWM of 10 bits.
+def simulate_pwm(servo: Servo, targets: np.ndarray, period: float = 2e-3, bits: int = 10) -> Motion:
+    """Return the motion of a servo whose firmware runs every 2 ms with a PWM of 10 bits.
 
     The shaft is integrated at half the step by explicit equations that hold it while its
     friction exceeds all other torques.
@@ -168,11 +184,11 @@ def simulate_pwm(servo, targets, period=2e-3, bits=10):
                 speed += (torque - math.copysign(servo.coulomb, speed)) / inertia * substep
                 speed = 0.0 if speed * before < 0.0 else speed
             position += speed * substep
-    return positions, duties
+    return Motion(positions, duties)
 
 
-def simulate_mujoco(servo, targets, kind):
-    """Return positions and duties of MuJoCo's `<position>` or `<dcmotor>` at a hinge."""
+def simulate_mujoco(servo: Servo, targets: np.ndarray, kind: str) -> Motion:
+    """Return the motion of MuJoCo's `<position>` or `<dcmotor>` at a hinge."""
     gain = servo.stall_torque * servo.duty_gain
     damping = servo.torque_constant**2 / servo.resistance
     actuator = (
@@ -198,10 +214,17 @@ def simulate_mujoco(servo, targets, kind):
         duties[row] = duty
         data.ctrl[0] = target if kind == "mujoco_position" else duty * servo.volts
         mujoco.mj_step(model, data)
-    return positions, duties
+    return Motion(positions, duties)
 
 
-def servo_log(servo, kind="bam", seed=0, duration=12.0, rate=200.0, with_duty=False):
+def servo_log(
+    servo: Servo,
+    kind: str = "bam",
+    seed: int = 0,
+    duration: float = 12.0,
+    rate: float = 200.0,
+    with_duty: bool = False,
+) -> Log:
     """Return a log of a servo: commands, and positions of an encoder with 4096 counts a turn."""
     times, targets, held = _held(servo, seed, duration, rate)
     if kind.startswith("mujoco"):

@@ -12,7 +12,9 @@ import csv
 import json
 import math
 import sys
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,8 +35,32 @@ ERROR_GAIN, VOLTS, STEP = 0.00246, 7.4, 0.005
 """Duty per angle error and register, supply [V] and time step [s] of BAM's XL330."""
 
 
-def fit_draw(kind, seed):
-    """Return rows of a fit: kind, seed, parameter, truth, value, low, high, status."""
+class Comparison(NamedTuple):
+    """A fitted parameter and its truth."""
+
+    kind: str  # of the simulation
+    seed: int
+    name: str
+    truth: float
+    value: float
+    low: float
+    high: float
+    status: str
+
+
+class Accuracy(NamedTuple):
+    """How well a parameter is identified in the logs of a kind of simulation."""
+
+    simulation: str
+    parameter: str
+    logs: int
+    identified: int  # number of logs
+    inside_interval: int  # number of the identified ones
+    median_half_width: str  # of the identified ones: absolute, or relative to the value
+
+
+def fit_draw(kind: str, seed: int) -> list[Comparison]:
+    """Compare the parameters of a fit with their truth."""
     servo = servo_simulators.draw(seed, kind)
     log = servo_simulators.servo_log(servo, kind, seed)
     result = identify_servo([log], known=servo.known, friction=FRICTION.get(kind, "coulomb"))
@@ -43,15 +69,18 @@ def fit_draw(kind, seed):
         truth = servo.truth.get(estimate.name)
         if truth is None or estimate.status == "given" or estimate.name in UNTOLD.get(kind, ()):
             continue
-        values = (truth, estimate.value, estimate.low, estimate.high)
-        texts = (f"{value:.6g}" for value in values)
-        rows.append((kind, seed, estimate.name, *texts, estimate.status))
+        value, low, high = (
+            float(f"{number:.6g}") for number in (estimate.value, estimate.low, estimate.high)
+        )
+        truth = float(f"{truth:.6g}")
+        row = Comparison(kind, seed, estimate.name, truth, value, low, high, estimate.status)
+        rows.append(row)
     return rows
 
 
-def study_draws(path, seeds, kinds):
+def study_draws(path: Path, seeds: Iterable[int], kinds: Sequence[str]) -> None:
     """Fit the servos of seeds that are not in a file yet, and append their rows."""
-    fitted = {(row[0], int(row[1])) for row in read_rows(path)}
+    fitted = {(row.kind, row.seed) for row in read_rows(path)}
     with path.open("a", newline="") as file:
         writer = csv.writer(file)
         for seed in seeds:
@@ -61,41 +90,49 @@ def study_draws(path, seeds, kinds):
                     file.flush()
 
 
-def read_rows(path):
+def read_rows(path: Path) -> list[Comparison]:
     """Return the rows of a file; none if it does not exist."""
     if not path.exists():
         return []
     with path.open(newline="") as file:
-        return list(csv.reader(file))
+        return [
+            Comparison(
+                *(kind, int(seed), name, float(truth), float(value), float(low), float(high)),
+                status,
+            )
+            for kind, seed, name, truth, value, low, high, status in csv.reader(file)
+        ]
 
 
-def summarize(rows):
-    """Return kind, parameter, logs, identified, right among these, and median half-width."""
-    groups = {}
-    for kind, _, name, *numbers, status in rows:
-        groups.setdefault((kind, name), []).append((*map(float, numbers), status))
+def summarize(rows: Iterable[Comparison]) -> list[Accuracy]:
+    """Return the accuracy of each parameter in each kind of simulation."""
+    groups: dict[tuple[str, str], list[Comparison]] = {}
+    for row in rows:
+        groups.setdefault((row.kind, row.name), []).append(row)
     summary = []
     for (kind, name), group in groups.items():
-        identified = [row for row in group if row[4] == "identified"]
-        right = sum(row[2] <= row[0] <= row[3] for row in identified)
-        widths = [(row[3] - row[2]) / 2.0 for row in identified]
+        identified = [row for row in group if row.status == "identified"]
+        inside = sum(row.low <= row.truth <= row.high for row in identified)
+        widths = [(row.high - row.low) / 2.0 for row in identified]
         if name not in ("command_delay", "zero"):
-            widths = [width / abs(row[1]) for width, row in zip(widths, identified, strict=True)]
+            widths = [width / abs(row.value) for width, row in zip(widths, identified, strict=True)]
         width = f"{np.median(widths):.3g}" if widths else ""
-        summary.append((kind, name, len(group), len(identified), right, width))
-    return sorted(summary, key=lambda row: (servo_simulators.KINDS.index(row[0]), row[1]))
+        summary.append(Accuracy(kind, name, len(group), len(identified), inside, width))
+    kinds = servo_simulators.KINDS
+    return sorted(summary, key=lambda entry: (kinds.index(entry.simulation), entry.parameter))
 
 
-def write_summary(rows):
+def write_summary(rows: Iterable[Comparison]) -> None:
     """Write the summary into the documentation."""
     with SUMMARY.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        heads = "simulation", "parameter", "logs", "identified", "inside_interval"
-        writer.writerow((*heads, "median_half_width"))
+        writer.writerow(Accuracy._fields)
         writer.writerows(summarize(rows))
 
 
-def bam_friction(parameters, motor, external, speed):
+def bam_friction(
+    parameters: Mapping[str, float], motor: float, external: float, speed: float
+) -> float:
     """Return the friction torque of BAM's models M1, M4 and M6 [N*m], without viscous friction."""
     get = parameters.get
     stribeck = 0.0
@@ -115,7 +152,7 @@ def bam_friction(parameters, motor, external, speed):
     return friction
 
 
-def bam_error(path, parameters):
+def bam_error(path: Path, parameters: Mapping[str, float]) -> float:
     """Return the mean absolute error [rad] of a log simulated by BAM's equations."""
     content = json.loads(path.read_text())
     entries = content["entries"]
@@ -146,34 +183,39 @@ def bam_error(path, parameters):
     return float(np.mean(np.array(errors)[enabled > 0.5]))
 
 
-def study_xl330(folder, parameters):
+def study_xl330(folder: Path, parameters: Path) -> None:
     """Print the errors on the held-out logs of each gain, for our fits and for BAM's parameters."""
     logs = {path: read_log(path, COLUMNS) for path in sorted(folder.glob("*.json"))}
-    known, errors = {"mass": 0.49, "length": 0.1}, {}
+    known = {"mass": 0.49, "length": 0.1}
+    errors: dict[tuple[str, int], list[float]] = {}
     for friction in ("load", "coulomb"):
         for gain in GAINS:
             fitted = [log for log in logs.values() if log.constants["kp"] != gain]
             held_out = [log for log in logs.values() if log.constants["kp"] == gain]
             result = identify_servo(fitted, "pendulum", known, friction, held_out)
-            errors[friction, gain] = [error.closed_loop for error in result.held_out]
+            errors[friction, gain] = [
+                log.closed_loop for log in result.held_out if log.closed_loop is not None
+            ]
             print_errors(friction, gain, errors[friction, gain])
-        print_errors(friction, "all", np.concatenate([errors[friction, gain] for gain in GAINS]))
+        print_errors(friction, "all", [error for gain in GAINS for error in errors[friction, gain]])
     for model in ("m1", "m4", "m6"):
         values = json.loads((parameters / f"{model}.json").read_text())
         for gain in GAINS:
             paths = [path for path, log in logs.items() if log.constants["kp"] == gain]
             errors[model, gain] = [bam_error(path, values) for path in paths]
             print_errors(f"BAM {model}", gain, errors[model, gain])
-        print_errors(f"BAM {model}", "all", np.concatenate([errors[model, gain] for gain in GAINS]))
+        print_errors(
+            f"BAM {model}", "all", [error for gain in GAINS for error in errors[model, gain]]
+        )
 
 
-def print_errors(name, gain, errors):
+def print_errors(name: str, gain: int | str, errors: Sequence[float]) -> None:
     """Print errors in mrad, and their mean."""
     listed = " ".join(f"{1e3 * error:.0f}" for error in errors)
     print(f"{name:8} gain {gain}: mean {1e3 * np.mean(errors):.1f} mrad ({listed})", flush=True)
 
 
-def main():
+def main() -> int:
     """Run a study."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
