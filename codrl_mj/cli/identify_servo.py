@@ -104,7 +104,9 @@ class IdentifyServo:
 
         bad = []
         for log in logs:
-            findings = [one for one in check(log, rig=self.load) if one.severity != "info"]
+            findings = [
+                finding for finding in check(log, rig=self.load) if finding.severity != "info"
+            ]
             if findings:
                 print_findings(log.name, findings)
             if any(finding.severity == "error" for finding in findings):

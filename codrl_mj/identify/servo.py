@@ -395,11 +395,13 @@ def _finish(
     return [by_name[name] for name in PARAMETERS if name in by_name]
 
 
-def _with_other_law(estimate: Estimate, other: float, by_name: Mapping[str, Estimate]) -> Estimate:
+def _with_other_law(
+    estimate: Estimate, other_stall: float, by_name: Mapping[str, Estimate]
+) -> Estimate:
     """Return a stall torque that covers the value by the other law, if that lies outside."""
-    if estimate.low <= other <= estimate.high:
+    if estimate.low <= other_stall <= estimate.high:
         return estimate
-    widened = _widened(estimate, 1.25 * abs(other - estimate.value), "limit", by_name)
+    widened = _widened(estimate, 1.25 * abs(other_stall - estimate.value), "limit", by_name)
     if widened.status == "identified":
         return dataclasses.replace(widened, status="rough", why=CAUSES["limit"])
     return widened
@@ -537,14 +539,14 @@ def _electrical(stall: Estimate, damping: Estimate, arguments: _Arguments) -> di
     if math.isnan(resistance) and math.isnan(constant):
         return {}
     if math.isnan(constant):
-        given = Estimate("resistance", resistance, resistance, resistance, "given")
+        known = Estimate("resistance", resistance, resistance, resistance, "given")
         unit = Estimate("resistance", 1.0, 1.0, 1.0, "given")
-        other = _ratio("torque_constant", stall, unit, resistance / volts)
-        constant = other.value
+        computed = _ratio("torque_constant", stall, unit, resistance / volts)
+        constant = computed.value
     else:
-        given = Estimate("torque_constant", constant, constant, constant, "given")
-        other = _ratio("resistance", given, stall, volts)
-        resistance = other.value
+        known = Estimate("torque_constant", constant, constant, constant, "given")
+        computed = _ratio("resistance", known, stall, volts)
+        resistance = computed.value
     braking = constant * constant / resistance
     viscous = Estimate(
         "viscous_friction",
@@ -554,7 +556,7 @@ def _electrical(stall: Estimate, damping: Estimate, arguments: _Arguments) -> di
         damping.status,
         "damping without kT*kE/R, if kE = kT and the firmware has no derivative gain",
     )
-    return {given.name: given, other.name: other, viscous.name: viscous}
+    return {known.name: known, computed.name: computed, viscous.name: viscous}
 
 
 def _per_inertia(by_name: Mapping[str, Estimate]) -> dict[str, Estimate]:

@@ -629,14 +629,14 @@ def log_disagreements(fit: Fit[Model]) -> dict[str, float]:
     limit = norm.ppf(1.0 - 0.005 / len(names))
     gaps = np.zeros(len(names))
     for log in sorted(set(logs)):
-        own = [index for index, number in enumerate(logs) if number == log]
+        indices = [index for index, number in enumerate(logs) if number == log]
         part = dataclasses.replace(
             fit,
-            segments=[fit.segments[index] for index in own],
-            residuals=tuple(fit.residuals[index] for index in own),
-            jacobians=tuple(fit.jacobians[index] for index in own),
+            segments=[fit.segments[index] for index in indices],
+            residuals=tuple(fit.residuals[index] for index in indices),
+            jacobians=tuple(fit.jacobians[index] for index in indices),
         )
-        gradients, matrices = _gauss_newton_sums(part, [blocks[index] for index in own])
+        gradients, matrices = _gauss_newton_sums(part, [blocks[index] for index in indices])
         count = len(gradients)
         if count < 2:
             continue

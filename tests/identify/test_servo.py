@@ -127,7 +127,10 @@ def test_logs_that_contradict_each_other_widen_the_intervals():
     """The second log is of a servo with twice the friction: no value holds for both."""
     servo = servo_simulators.draw(1)
     rough = dataclasses.replace(servo, coulomb=2.0 * servo.coulomb)
-    logs = [servo_simulators.servo_log(one, "bam", seed) for seed, one in enumerate((servo, rough))]
+    logs = [
+        servo_simulators.servo_log(simulated, "bam", seed)
+        for seed, simulated in enumerate((servo, rough))
+    ]
     friction = identify_servo(logs, known=servo.known)["coulomb_friction"]
     assert friction.causes["logs"] > 0.0
     assert friction.low < servo.coulomb * 1.2
