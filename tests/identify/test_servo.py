@@ -11,6 +11,7 @@ import pytest
 import servo_simulators
 import study_servo_fit
 from codrl_mj.actuators import resolve
+from codrl_mj.cli import main
 from codrl_mj.identify import Log, check
 from codrl_mj.identify.servo import identify_servo
 from codrl_mj.identify.servo_model import ServoModel
@@ -71,6 +72,21 @@ def test_the_result_is_a_pwm_servo_that_moves_alike(bam, tmp_path):
     assert motor.rotor_inertia == pytest.approx(truth["armature"], rel=0.03)
     low, high = result.intervals()["loop.command_delay"]
     assert low <= actuator.loop.command_delay <= high
+
+
+def test_the_command_writes_an_actuator_a_result_and_a_page(tmp_path, capsys):
+    servo = servo_simulators.draw(1)
+    log = servo_simulators.servo_log(servo, "bam", 1)
+    table = np.stack([log.time, log.signals["command"], log.signals["position"]], axis=1)
+    path, out = tmp_path / "swing.csv", tmp_path / "motor"
+    np.savetxt(path, table, delimiter=",", header="t,goal,present", comments="")
+    columns = "time=t:s,command=goal:rad,position=present:rad"
+    known = [f"{name}={value}" for name, value in servo.known.items()]
+    arguments = ["--columns", columns, "--load", "pendulum", "--known", *known]
+    assert main(["identify", "servo", str(path), *arguments, "--out", str(out)]) == 0
+    assert {file.name for file in out.iterdir()} == {"actuator.yaml", "result.json", "report.html"}
+    assert "position_gain" in capsys.readouterr().out
+    assert resolve(str(out / "actuator.yaml"), None, "a test").family == "pwm_servo"
 
 
 def test_without_a_load_only_ratios_to_the_inertia_are_identified():
