@@ -49,7 +49,7 @@ class Comparison(NamedTuple):
 
 
 class Accuracy(NamedTuple):
-    """How well a parameter is identified in the logs of a kind of simulation."""
+    """Accuracy of a parameter over the logs of a kind of simulation."""
 
     simulation: str
     parameter: str
