@@ -24,7 +24,11 @@ from codrl_mj.actuators import (
     Ideal,
     Inputs,
     Lag,
+    PwmLoop,
+    PwmServo,
     SampledLoop,
+    SharedDrive,
+    SharedSupply,
     Supply,
     TorqueSpeed,
     parameters_type,
@@ -290,6 +294,18 @@ EXAMPLES: tuple[ActuatorModel, ...] = (
     Lag(time_constant=0.03, delay=0.013),
     TorqueSpeed(stall_torque=0.2, no_load_speed=1.0, max_torque=0.2),
     Drive(GearMotor(gear_ratio=3.0), SampledLoop(sample_rate=10e3, max_current=4.0), Supply(6.0)),
+    SharedDrive(
+        GearMotor(gear_ratio=3.0),
+        SampledLoop(sample_rate=10e3, max_current=4.0),
+        SharedSupply(6.0, 0.5),
+    ),
+    PwmServo(
+        GearMotor(gear_ratio=3.0),
+        PwmLoop(
+            deadband=0.01, start_duty=0.05, max_velocity=3.0, command_rate=50.0, command_jitter=2e-3
+        ),
+        Supply(6.0, 0.5),
+    ),
 )
 """Actuators in which every parameter matters and limits are reached, unlike their defaults."""
 
@@ -306,7 +322,10 @@ def compiled_checks(quick: bool) -> Iterator[Check]:
     commanded = [
         command.actuator for actuator in registered for command in actuator.commands().values()
     ]
-    actuators = list({type(actuator): actuator for actuator in (*commanded, *registered)}.values())
+    kinds = {type(actuator): actuator for actuator in (*commanded, *registered)}
+    actuators = [
+        _on_own_supply(actuator, number + 1) for number, actuator in enumerate(kinds.values())
+    ]
     for actuator in actuators:
         load_family(type(actuator))
     model = build_rotors(ECCENTRIC_ROTOR, actuators, 0.01)
@@ -317,6 +336,14 @@ def compiled_checks(quick: bool) -> Iterator[Check]:
         yield from compiled_advance(
             compared_names(actuator), *values[index], family=type(actuator).__name__
         )
+
+
+def _on_own_supply(actuator: ActuatorModel, number: int) -> ActuatorModel:
+    """Return an actuator that shares its supply with no other one, as plain Python computes it."""
+    if not isinstance(actuator, SharedDrive):
+        return actuator
+    supply = dataclasses.replace(actuator.shared_supply, number=number)
+    return dataclasses.replace(actuator, supply=supply)
 
 
 @check("motor", Check("compiled advance: {family}", "the same function in plain Python", 0.0, UNIT))

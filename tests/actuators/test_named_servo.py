@@ -196,7 +196,7 @@ def test_messages_explain_how_to_make_a_servo(capsys, files):
     assert "--actuator.loop.controls velocity)" in assert_refused(
         capsys, f"{train} --env.action velocity"
     )
-    assert "add --actuator.family servo" in assert_refused(
+    assert "or --actuator.family servo to make a motor a servo" in assert_refused(
         capsys, f"{train} --actuator.loop.position-gain 3"
     )
 
