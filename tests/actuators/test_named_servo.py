@@ -15,7 +15,10 @@ import codrl_mj
 from codrl_mj.actuators import (
     Drive,
     Servo,
+    ServoFriction,
     ServoLoop,
+    SharedSupply,
+    Supply,
     display_label,
     display_name,
     named_mapping,
@@ -209,3 +212,21 @@ def test_a_servo_in_a_file_is_shown_with_its_motor_and_loops(capsys, files):
     assert find_drive("servo_sheet.yaml") == override_actuator(
         find_drive("sheet.toml"), {"motor": SERVO["motor"]}
     )
+
+
+@pytest.mark.parametrize("family", ["shared_drive", "servo", "pwm_servo"])
+def test_another_family_keeps_the_supply_and_goes_back(family):
+    drive = Drive(supply=Supply(48.0, 0.1), friction=ServoFriction(base=0.2))
+    other = override_actuator(drive, {"family": family})
+    assert (other.supply.voltage, other.supply.resistance) == (48.0, 0.1)
+    assert override_actuator(other, {"family": "drive"}) == drive
+    nominal = resolve(MOTOR, None, "x").supply.voltage
+    assert resolve({"name": MOTOR, "family": family}, None, "x").supply.voltage == nominal
+
+
+def test_a_shared_drive_becomes_a_servo_on_a_supply_of_its_own():
+    drive = override_actuator(
+        Drive(supply=Supply(48.0)), {"family": "shared_drive", "supply": {"number": 3}}
+    )
+    assert drive.supply == SharedSupply(48.0, number=3)
+    assert override_actuator(drive, {"family": "servo"}).supply == Supply(48.0)
