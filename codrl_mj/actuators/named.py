@@ -452,18 +452,36 @@ def _shared_fields(base: ActuatorModel, kind: Family) -> dict[str, FieldValue]:
     return shared
 
 
-def _check_fields(names: Iterable[str], kind: Family) -> None:
-    """Raise if only a related family has one of the fields; the message names that family."""
-    for name in names:
+def _has_field(family: Family, path: str) -> bool:
+    """Return True if a family has a field, or a part with a field such as `supply.number`."""
+    name, _, inner = path.partition(".")
+    part = nested_types(family).get(name)
+    return name in _field_names(family) and (
+        not inner or part is None or inner in {field.name for field in dataclasses.fields(part)}
+    )
+
+
+def _check_fields(fields_set: Mapping[str, FieldValue], kind: Family) -> None:
+    """Raise if only families that the actuator can become have a field; the message names them."""
+    paths = [
+        path
+        for name, value in fields_set.items()
+        for path in ([f"{name}.{key}" for key in value] if isinstance(value, Mapping) else [name])
+    ]
+    for path in paths:
         owners = [
-            family
+            repr(family)
             for family, family_class in FAMILIES.items()
-            if issubclass(family_class, kind) and name in _field_names(family_class)
+            if (
+                issubclass(family_class, kind)
+                or (issubclass(family_class, Geared) and issubclass(kind, Geared))
+            )
+            and _has_field(family_class, path)
         ]
-        if owners and name not in _field_names(kind):
+        if owners and not _has_field(kind, path):
             raise ValueError(
-                f"unknown actuator field {name} of a {family_name(kind)}: add family ="
-                f" {owners[0]!r}"
+                f"unknown actuator field {path} of a {family_name(kind)}: add family ="
+                f" {' or '.join(owners)}"
             )
 
 

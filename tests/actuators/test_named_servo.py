@@ -153,7 +153,15 @@ def test_an_agent_commands_positions_or_speeds_of_a_named_motor(controls):
         ),
         (
             {"name": MOTOR, "loop": {"position_gain": 3}},
-            "unknown actuator field loop of a drive: add family = 'servo'",
+            "field loop.position_gain of a drive: add family = 'pwm_servo' or 'servo'",
+        ),
+        (
+            {"name": MOTOR, "supply": {"number": 2}},
+            "unknown actuator field supply.number of a drive: add family = 'shared_drive'",
+        ),
+        (
+            {"name": MOTOR, "family": "servo", "loop": {"start_duty": 0.1}},
+            "field loop.start_duty of a servo: add family = 'pwm_servo'",
         ),
         ({"family": "servo", "motor": MOTOR}, f"write name = '{MOTOR}' beside the family"),
         ({"name": "lag", "family": "servo"}, "cannot replace the family 'lag'"),
@@ -199,7 +207,7 @@ def test_messages_explain_how_to_make_a_servo(capsys, files):
     assert "--actuator.loop.controls velocity)" in assert_refused(
         capsys, f"{train} --env.action velocity"
     )
-    assert "add --actuator.family servo" in assert_refused(
+    assert "add --actuator.family pwm_servo or --actuator.family servo to make" in assert_refused(
         capsys, f"{train} --actuator.loop.position-gain 3"
     )
 
