@@ -18,7 +18,7 @@ import numpy as np
 from codrl_mj.actuators import sampled, shaft, stability
 from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.gear_motor import GearMotor
-from codrl_mj.actuators.geared import Geared, has_single_friction
+from codrl_mj.actuators.geared import Geared, has_single_friction, has_valid_temperatures
 from codrl_mj.actuators.model import Command, FamilyTuple, Inputs, UnstableError
 from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
@@ -392,13 +392,8 @@ class Drive(Geared):
         columns = stability.parameter_columns(cls, parameter_values)
         samples = timestep * columns.sample_rate
         valid = (abs(samples - np.round(samples)) <= 1e-6 * samples) & (samples >= 0.5)
-        valid &= columns.max_temperature > columns.ambient_temperature
         valid &= columns.bandwidth <= columns.sample_rate / (2.0 * math.pi)
-        valid &= np.isinf(columns.max_temperature) | (
-            columns.thermal_resistance_winding + columns.thermal_resistance_housing > 0.0
-        )
-        valid &= 1.0 + columns.resistance_coefficient * (columns.ambient_temperature - 25.0) > 0.0
-        valid &= has_single_friction(columns)
+        valid &= has_valid_temperatures(columns) & has_single_friction(columns)
         return np.where(valid, _radii(cls, parameter_values), np.inf)
 
 

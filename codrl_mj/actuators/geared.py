@@ -30,6 +30,16 @@ def has_single_friction(columns: ParameterColumns) -> np.ndarray:
     return single
 
 
+def has_valid_temperatures(columns: ParameterColumns) -> np.ndarray:
+    """Return True for actuators whose temperatures and resistance `GearMotor` accepts."""
+    can_heat = columns.thermal_resistance_winding + columns.thermal_resistance_housing > 0.0
+    valid: np.ndarray = columns.max_temperature > columns.ambient_temperature
+    valid = valid & (np.isinf(columns.max_temperature) | can_heat)
+    # The resistance at the ambient temperature must be positive.
+    valid &= 1.0 + columns.resistance_coefficient * (columns.ambient_temperature - 25.0) > 0.0
+    return valid
+
+
 class Geared(ActuatorModel):
     """Base class of the families with the fields `motor`, `supply` and `friction`.
 

@@ -21,7 +21,7 @@ from codrl_mj.actuators.pwm_servo import PwmServo
 from codrl_mj.actuators.servo import Servo
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 from codrl_mj.catalogue import joint_names, motor_entry, motor_names
-from codrl_mj.fields import declared_nested_types
+from codrl_mj.fields import nested_types
 from codrl_mj.user_code import allow_imports_from_files, look_up, read_yaml
 
 Named = TypeVar("Named", bound=ActuatorModel)
@@ -375,9 +375,7 @@ def override_actuator(base: ActuatorModel, changes: Mapping[str, FieldValue]) ->
     if family != family_name(kind):
         kind = _related_family(family, kind)
     _check_fields(fields_set, kind)
-    merged: dict[str, FieldValue] = {
-        key: value for key, value in base.as_mapping().items() if key in _shared(kind, type(base))
-    }
+    merged = _shared_fields(base, kind)
     loop_fields = fields_set.get("loop", {})
     if issubclass(kind, PwmServo) and type(base) is not kind and isinstance(loop_fields, Mapping):
         merged["loop"] = kind.factory_settings(display_label(base), loop_fields)
@@ -434,28 +432,56 @@ def _field_names(kind: Family) -> set[str]:
     return {field.name for field in dataclasses.fields(kind)}
 
 
-def _shared(kind: Family, base: Family) -> set[str]:
-    """Return the names of the fields that two families share, with parts of the same kind."""
-    parts, base_parts = (declared_nested_types(family) for family in (kind, base))
-    return {
-        name
-        for name in _field_names(kind) & _field_names(base)
-        if parts.get(name) == base_parts.get(name)
-    }
+def _shared_fields(base: ActuatorModel, kind: Family) -> dict[str, FieldValue]:
+    """Return those fields of an actuator that a family also has.
+
+    Parts of related classes share fields too: a `SharedSupply` has those of a `Supply`. Parts of
+    other classes, such as the loops of two kinds of servo, share none.
+    """
+    parts, base_parts = nested_types(kind), nested_types(type(base))
+    shared = {}
+    for name, value in base.as_mapping().items():
+        part, base_part = parts.get(name), base_parts.get(name)
+        if name not in _field_names(kind):
+            continue
+        if part is base_part:
+            shared[name] = value
+        elif part and base_part and (issubclass(part, base_part) or issubclass(base_part, part)):
+            known = {field.name for field in dataclasses.fields(part)}
+            shared[name] = value and {key: value[key] for key in value if key in known}
+    return shared
 
 
-def _check_fields(names: Iterable[str], kind: Family) -> None:
-    """Raise if only a related family has one of the fields; the message names that family."""
-    for name in names:
+def _has_field(family: Family, path: str) -> bool:
+    """Return True if a family has a field, or a part with a field such as `supply.number`."""
+    name, _, inner = path.partition(".")
+    part = nested_types(family).get(name)
+    return name in _field_names(family) and (
+        not inner or part is None or inner in {field.name for field in dataclasses.fields(part)}
+    )
+
+
+def _check_fields(fields_set: Mapping[str, FieldValue], kind: Family) -> None:
+    """Raise if only families that the actuator can become have a field; the message names them."""
+    paths = [
+        path
+        for name, value in fields_set.items()
+        for path in ([f"{name}.{key}" for key in value] if isinstance(value, Mapping) else [name])
+    ]
+    for path in paths:
         owners = [
-            family
+            repr(family)
             for family, family_class in FAMILIES.items()
-            if issubclass(family_class, kind) and name in _field_names(family_class)
+            if (
+                issubclass(family_class, kind)
+                or (issubclass(family_class, Geared) and issubclass(kind, Geared))
+            )
+            and _has_field(family_class, path)
         ]
-        if owners and name not in _field_names(kind):
+        if owners and not _has_field(kind, path):
             raise ValueError(
-                f"unknown actuator field {name} of a {family_name(kind)}: add family ="
-                f" {owners[0]!r}"
+                f"unknown actuator field {path} of a {family_name(kind)}: add family ="
+                f" {' or '.join(owners)}"
             )
 
 

@@ -18,7 +18,7 @@ from codrl_mj.actuators import drive, shaft, stability
 from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.firmware import FIRMWARES, find_firmware
 from codrl_mj.actuators.gear_motor import GearMotor
-from codrl_mj.actuators.geared import Geared, has_single_friction
+from codrl_mj.actuators.geared import Geared, has_single_friction, has_valid_temperatures
 from codrl_mj.actuators.model import Command, Inputs, UnstableError
 from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.pwm_loop import (
@@ -248,7 +248,8 @@ def advance(
     resistance = shaft.resistance_at(parameters, temperature)
     is_hot = 1.0 if temperature > parameters.max_temperature else 0.0
     newest = int(inputs.time / max(1.0 / parameters.command_rate, timestep) + SLACK)
-    is_new = is_first or newest + 1.0 > state.sent
+    # The number is smaller if the simulation's time was set back.
+    is_new = is_first or newest + 1.0 != state.sent
     start = inputs.position / ratio
     commands = sent_commands(state, inputs.desired_torque / ratio, start, is_new)
     count = max(int(timestep * parameters.servo_rate + 0.5), 1)
@@ -488,7 +489,8 @@ class PwmServo(Geared):
         valid = latest <= (HISTORY - 1) * interval * (1.0 + 1e-9)
         valid &= _rates_match(columns.servo_rate, timestep)
         valid &= columns.start_duty <= columns.max_duty
-        valid &= np.isfinite(columns.supply_voltage) & has_single_friction(columns)
+        valid &= np.isfinite(columns.supply_voltage)
+        valid &= has_valid_temperatures(columns) & has_single_friction(columns)
         return np.where(valid, 0.0, np.inf)
 
     def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:

@@ -67,9 +67,9 @@ _PARTS = (equations.StepConstants, equations.Piece, equations.Sampled, StepAvera
 _OFFSETS = tuple(8 * sum(len(part._fields) for part in _PARTS[:n]) for n in range(len(_PARTS)))
 _COMMAND = sum(len(part._fields) for part in _PARTS)
 """Offset of a drive's commanded voltage in its work array, after its parts."""
-_REQUESTED, _CURRENT, _IS_FREE = _COMMAND + 1, _COMMAND + 2, _COMMAND + 3
+REQUESTED, CURRENT, _IS_FREE = _COMMAND + 1, _COMMAND + 2, _COMMAND + 3
 """Offsets of the requested voltage, the current, and 1 while the drive counts as not saturated."""
-_WORK_SIZE = _COMMAND + 4
+WORK_SIZE = _COMMAND + 4
 """Number of float64 in the work array of a drive."""
 
 _FUNCTION_ADDRESS = np.zeros(1, dtype=np.uintp)
@@ -135,7 +135,7 @@ def bus_voltage(
     saturated drives and the power P of the others, V^2 - (E - Rs*S)*V + Rs*P = 0.
 
     Args:
-        work: array with the entries `_REQUESTED`, `_CURRENT` and `_IS_FREE` for each drive.
+        work: array with the entries `REQUESTED`, `CURRENT` and `_IS_FREE` for each drive.
         size: number of entries per drive.
         count: number of drives.
         source: voltage [V] of the source.
@@ -151,10 +151,10 @@ def bus_voltage(
     for _ in range(count + 1):
         power, below, largest = 0.0, 0.0, -1
         for motor in range(count):
-            requested = work[size * motor + _REQUESTED]
+            requested = work[size * motor + REQUESTED]
             if work[size * motor + _IS_FREE] == 0.0:
                 continue
-            drawn = work[size * motor + _CURRENT]
+            drawn = work[size * motor + CURRENT]
             power += abs(requested) * (drawn if requested > 0.0 else -drawn)
             if largest < 0 or abs(requested) > below:
                 below, largest = abs(requested), motor
@@ -163,7 +163,7 @@ def bus_voltage(
         voltage = 0.5 * (available + math.sqrt(max(square, 0.0)))
         if largest < 0 or (square >= 0.0 and voltage >= below):
             break
-        requested, drawn = work[size * largest + _REQUESTED], work[size * largest + _CURRENT]
+        requested, drawn = work[size * largest + REQUESTED], work[size * largest + CURRENT]
         saturated += drawn if requested > 0.0 else -drawn
         work[size * largest + _IS_FREE], above = 0.0, below
     voltage = min(max(voltage, 0.0), above)
@@ -201,11 +201,11 @@ def load_supplies() -> CompiledCallback[[int, int, float], float]:
 
     @cfunc(types.float64(types.uintp, types.int64, types.float64), nogil=True, error_model="numpy")
     def advance(rows: int, count: int, timestep: float) -> float:
-        memory = stack_floats(_WORK_SIZE * count)
+        memory = stack_floats(WORK_SIZE * count)
         work = entry_address(memory, 0)
         supply = read(u64(rows)[1], parameters_of)
         for motor in range(count):
-            row, parts = rows + 8 * ROW_SIZE * motor, work + 8 * _WORK_SIZE * motor
+            row, parts = rows + 8 * ROW_SIZE * motor, work + 8 * WORK_SIZE * motor
             step, piece, sampled = begin_step(
                 read(u64(row)[1], parameters_of),
                 timestep,
@@ -222,7 +222,7 @@ def load_supplies() -> CompiledCallback[[int, int, float], float]:
         samples = max(int(timestep * supply.sample_rate + 0.5), 1)
         for _ in range(samples):
             for motor in range(count):
-                row, parts = rows + 8 * ROW_SIZE * motor, work + 8 * _WORK_SIZE * motor
+                row, parts = rows + 8 * ROW_SIZE * motor, work + 8 * WORK_SIZE * motor
                 sampled = read(parts + sampled_at, sampled_type)
                 command, requested = request_voltage(
                     read(u64(row)[1], parameters_of),
@@ -231,16 +231,16 @@ def load_supplies() -> CompiledCallback[[int, int, float], float]:
                     sampled,
                     f64(row)[0] != 0.0,
                 )
-                memory[_WORK_SIZE * motor + _COMMAND] = command
-                memory[_WORK_SIZE * motor + _REQUESTED] = requested
-                memory[_WORK_SIZE * motor + _CURRENT] = sampled.current
+                memory[WORK_SIZE * motor + _COMMAND] = command
+                memory[WORK_SIZE * motor + REQUESTED] = requested
+                memory[WORK_SIZE * motor + CURRENT] = sampled.current
             voltage = bus_voltage(
-                *(memory, _WORK_SIZE, count, supply.supply_voltage, supply.supply_resistance),
+                *(memory, WORK_SIZE, count, supply.supply_voltage, supply.supply_resistance),
                 supply.supply_recharges != 0.0,
             )
             supplied = 0.0
             for motor in range(count):
-                row, parts = rows + 8 * ROW_SIZE * motor, work + 8 * _WORK_SIZE * motor
+                row, parts = rows + 8 * ROW_SIZE * motor, work + 8 * WORK_SIZE * motor
                 piece, sampled, averages, bridge_current = advance_sample(
                     read(u64(row)[1], parameters_of),
                     timestep,
@@ -248,8 +248,8 @@ def load_supplies() -> CompiledCallback[[int, int, float], float]:
                     read(parts + piece_at, piece_type),
                     read(parts + sampled_at, sampled_type),
                     read(parts + averages_at, averages_type),
-                    memory[_WORK_SIZE * motor + _COMMAND],
-                    memory[_WORK_SIZE * motor + _REQUESTED],
+                    memory[WORK_SIZE * motor + _COMMAND],
+                    memory[WORK_SIZE * motor + REQUESTED],
                     voltage,
                     f64(row)[0] != 0.0,
                 )
@@ -259,7 +259,7 @@ def load_supplies() -> CompiledCallback[[int, int, float], float]:
                 supplied += bridge_current
             volts, amperes = volts + voltage, amperes + source_current(supply, supplied)
         for motor in range(count):
-            row, parts = rows + 8 * ROW_SIZE * motor, work + 8 * _WORK_SIZE * motor
+            row, parts = rows + 8 * ROW_SIZE * motor, work + 8 * WORK_SIZE * motor
             state = u64(row)[2]
             after, torque, signals = end_step(
                 read(u64(row)[1], parameters_of),

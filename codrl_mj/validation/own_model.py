@@ -45,6 +45,7 @@ from codrl_mj.physics.variation import without_additions
 from codrl_mj.tasks import find_task, resolve_actuators
 from codrl_mj.validation.compare import FALLBACK_ACTUATOR, paper_actuators
 from codrl_mj.validation.execution import UNIT, commands, differs
+from codrl_mj.validation.in_python import advance_in_python
 from codrl_mj.validation.rotors import ECCENTRIC_ROTOR, EVERY_FEATURE, Loop, build_rotors
 from codrl_mj.validation.table import Case, Check, Skipped, check
 
@@ -131,6 +132,7 @@ def compare_with_python(
         # The copy has the quantities that the callback is about to see, and the resulting torque.
         mujoco.mj_forward(model, before)
         mujoco.mj_step(model, data)
+        inputs = {}
         for index, actuator in actuators.items():
             output = model.actuator_outadr[index]
             arm = arm_outside_gear(model, index, actuator)
@@ -138,7 +140,7 @@ def compare_with_python(
                 float(before.actuator_length[output]) / arm,
                 float(before.actuator_velocity[output]) / arm,
             )
-            address, limited = model.actuator_ctrladr[index], model.actuator_forcelimited[output]
+            address = model.actuator_ctrladr[index]
             command, range_ = float(control[address]), model.actuator_ctrlrange[address]
             command = (
                 float(np.clip(command, *range_)) if model.actuator_ctrllimited[address] else command
@@ -147,18 +149,20 @@ def compare_with_python(
             inertia = (
                 shaft_inertia(model, before, output, 1.0 / arm) if actuator.INERTIA else math.inf
             )
-            inputs = Inputs(desired, *motion, before.time, index + 1.0, inertia)
-            states[index], torque, signals = actuator.advance(
-                parameters[index], model.opt.timestep, states[index], inputs
-            )
+            inputs[index] = Inputs(desired, *motion, before.time, index + 1.0, inertia)
+        advanced = advance_in_python(actuators, parameters, model.opt.timestep, states, inputs)
+        for index, (state, torque, signals) in advanced.items():
+            states[index], output = state, model.actuator_outadr[index]
+            arm = arm_outside_gear(model, index, actuators[index])
+            limited = model.actuator_forcelimited[output]
             torque = (
                 float(np.clip(torque / arm, *model.actuator_forcerange[output]))
                 if limited
                 else torque / arm
             )
-            oracle = [*states[index], *signals, torque]
+            oracle = [*state, *signals, torque]
             # A slot holds the accepted state, then the candidate state, then the signals.
-            after = SLOT_HEADER_SIZE + len(states[index])
+            after = SLOT_HEADER_SIZE + len(state)
             results[index][0, step] = (
                 *slot_of[index][after : after + len(oracle) - 1],
                 before.actuator_force[output],
@@ -322,10 +326,7 @@ def compiled_checks(quick: bool) -> Iterator[Check]:
     commanded = [
         command.actuator for actuator in registered for command in actuator.commands().values()
     ]
-    kinds = {type(actuator): actuator for actuator in (*commanded, *registered)}
-    actuators = [
-        _on_own_supply(actuator, number + 1) for number, actuator in enumerate(kinds.values())
-    ]
+    actuators = list({type(actuator): actuator for actuator in (*commanded, *registered)}.values())
     for actuator in actuators:
         load_family(type(actuator))
     model = build_rotors(ECCENTRIC_ROTOR, actuators, 0.01)
@@ -336,14 +337,6 @@ def compiled_checks(quick: bool) -> Iterator[Check]:
         yield from compiled_advance(
             compared_names(actuator), *values[index], family=type(actuator).__name__
         )
-
-
-def _on_own_supply(actuator: ActuatorModel, number: int) -> ActuatorModel:
-    """Return an actuator that shares its supply with no other one, as plain Python computes it."""
-    if not isinstance(actuator, SharedDrive):
-        return actuator
-    supply = dataclasses.replace(actuator.shared_supply, number=number)
-    return dataclasses.replace(actuator, supply=supply)
 
 
 @check("motor", Check("compiled advance: {family}", "the same function in plain Python", 0.0, UNIT))

@@ -15,7 +15,10 @@ import codrl_mj
 from codrl_mj.actuators import (
     Drive,
     Servo,
+    ServoFriction,
     ServoLoop,
+    SharedSupply,
+    Supply,
     display_label,
     display_name,
     named_mapping,
@@ -150,7 +153,15 @@ def test_an_agent_commands_positions_or_speeds_of_a_named_motor(controls):
         ),
         (
             {"name": MOTOR, "loop": {"position_gain": 3}},
-            "unknown actuator field loop of a drive: add family = 'servo'",
+            "field loop.position_gain of a drive: add family = 'pwm_servo' or 'servo'",
+        ),
+        (
+            {"name": MOTOR, "supply": {"number": 2}},
+            "unknown actuator field supply.number of a drive: add family = 'shared_drive'",
+        ),
+        (
+            {"name": MOTOR, "family": "servo", "loop": {"start_duty": 0.1}},
+            "field loop.start_duty of a servo: add family = 'pwm_servo'",
         ),
         ({"family": "servo", "motor": MOTOR}, f"write name = '{MOTOR}' beside the family"),
         ({"name": "lag", "family": "servo"}, "cannot replace the family 'lag'"),
@@ -196,7 +207,7 @@ def test_messages_explain_how_to_make_a_servo(capsys, files):
     assert "--actuator.loop.controls velocity)" in assert_refused(
         capsys, f"{train} --env.action velocity"
     )
-    assert "or --actuator.family servo to make a motor a servo" in assert_refused(
+    assert "add --actuator.family pwm_servo or --actuator.family servo to make" in assert_refused(
         capsys, f"{train} --actuator.loop.position-gain 3"
     )
 
@@ -209,3 +220,21 @@ def test_a_servo_in_a_file_is_shown_with_its_motor_and_loops(capsys, files):
     assert find_drive("servo_sheet.yaml") == override_actuator(
         find_drive("sheet.toml"), {"motor": SERVO["motor"]}
     )
+
+
+@pytest.mark.parametrize("family", ["shared_drive", "servo", "pwm_servo"])
+def test_another_family_keeps_the_supply_and_goes_back(family):
+    drive = Drive(supply=Supply(48.0, 0.1), friction=ServoFriction(base=0.2))
+    other = override_actuator(drive, {"family": family})
+    assert (other.supply.voltage, other.supply.resistance) == (48.0, 0.1)
+    assert override_actuator(other, {"family": "drive"}) == drive
+    nominal = resolve(MOTOR, None, "x").supply.voltage
+    assert resolve({"name": MOTOR, "family": family}, None, "x").supply.voltage == nominal
+
+
+def test_a_shared_drive_becomes_a_servo_on_a_supply_of_its_own():
+    drive = override_actuator(
+        Drive(supply=Supply(48.0)), {"family": "shared_drive", "supply": {"number": 3}}
+    )
+    assert drive.supply == SharedSupply(48.0, number=3)
+    assert override_actuator(drive, {"family": "servo"}).supply == Supply(48.0)

@@ -281,6 +281,14 @@ def test_a_rate_that_is_no_divisor_of_the_steps_keeps_its_mean():
     assert set(np.diff(changes)) == {16, 17}
 
 
+def test_commands_are_taken_after_the_time_is_set_back():
+    bench = Bench(servo())
+    for _ in range(20):
+        bench.step(0.3)
+    bench.steps = 0
+    assert bench.step(0.4)[1].error == pytest.approx(0.4)
+
+
 def test_jitter_moves_each_arrival_and_repeats_with_its_key():
     actuator = servo(command_rate=50.0, command_delay=0.02, command_jitter=0.003, servo_rate=500.0)
     commands = (np.arange(20_000) // 10).astype(float)
@@ -291,6 +299,23 @@ def test_jitter_moves_each_arrival_and_repeats_with_its_key():
     assert lates.std() * 0.002 == pytest.approx(math.hypot(0.003, 0.002 / math.sqrt(12)), rel=0.06)
     np.testing.assert_array_equal(first, arrivals(actuator, commands))
     assert (first != arrivals(actuator, commands, noise_key=8.0)).any()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"ambient_temperature": 90.0},
+        {"ambient_temperature": -260.0},
+        {"thermal_resistance_winding": 0.0},
+    ],
+)
+def test_drawn_temperatures_that_a_motor_refuses_are_drawn_again(changes):
+    motor = dataclasses.replace(MOTOR, max_temperature=80.0, thermal_resistance_winding=20.0)
+    parameters = parameters_type(PwmServo)(*servo(motor=motor).parameter_values)
+    rows = np.array([parameters, parameters._replace(**changes)])
+    assert PwmServo.instability(rows, 0.002).tolist() == [0.0, math.inf]
+    with pytest.raises(ValueError, match="GearMotor"):
+        dataclasses.replace(motor, **changes)
 
 
 def test_a_hot_servo_is_off():

@@ -1,5 +1,6 @@
 """Drives that share a supply: against a stiff integration, energy, both backends and batches."""
 
+import dataclasses
 import math
 
 import mujoco
@@ -14,6 +15,7 @@ from codrl_mj.actuators import (
     Drive,
     GearMotor,
     SampledLoop,
+    ServoFriction,
     SharedDrive,
     SharedSupply,
     SharedVoltageDrive,
@@ -22,7 +24,8 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.engine.families import SLOT_HEADER_SIZE
 from codrl_mj.engine.specs import add_motors
-from codrl_mj.engine.supplies import _CURRENT, _REQUESTED, _WORK_SIZE, bus_voltage
+from codrl_mj.engine.supplies import CURRENT, REQUESTED, WORK_SIZE, bus_voltage
+from codrl_mj.validation import validate_model
 from tests.engine.models import add_motor
 
 SAMPLE_RATE, TIMESTEP = 20e3, 1e-3
@@ -164,13 +167,13 @@ def test_the_voltage_is_the_largest_solution_for_random_motors():
         count = int(random.integers(1, 6))
         requested, currents = random.normal(0.0, 10.0, count), random.normal(0.0, 8.0, count)
         source, resistance = random.uniform(5.0, 20.0), random.uniform(0.01, 1.0)
-        work = np.zeros(_WORK_SIZE * count)
-        work[_REQUESTED::_WORK_SIZE], work[_CURRENT::_WORK_SIZE] = requested, currents
-        voltage = bus_voltage.py_func(work, _WORK_SIZE, count, source, resistance, True)
+        work = np.zeros(WORK_SIZE * count)
+        work[REQUESTED::WORK_SIZE], work[CURRENT::WORK_SIZE] = requested, currents
+        voltage = bus_voltage.py_func(work, WORK_SIZE, count, source, resistance, True)
         expected = voltage_by_search(source, resistance, requested, currents)
         assert voltage == pytest.approx(expected, rel=1e-9, abs=1e-9)
         kinds |= {int((abs(requested) > voltage).sum()), "rise" if voltage > source else "sag"}
-        blocked = bus_voltage.py_func(work, _WORK_SIZE, count, source, resistance, False)
+        blocked = bus_voltage.py_func(work, WORK_SIZE, count, source, resistance, False)
         assert blocked == min(voltage, source)
     assert {0, 1, 2, "rise", "sag"} <= kinds
 
@@ -260,3 +263,24 @@ def test_motors_of_a_supply_must_agree():
         motor_of(0, supply, deadband=0.5)
     with pytest.raises(ValueError, match="voltage = inf: must be finite"):
         SharedSupply(math.inf)
+
+
+def test_the_certificate_runs_the_motors_of_a_supply_together():
+    motors = [motor_of(n, SharedSupply(12.0, 0.1, number=1 + n % 2)) for n in range(4)]
+    assert validate_model(wheels(motors), quick=True).passed
+    # Alone in plain Python, each motor would see another supply.
+    friction = ServoFriction(base=0.01, viscous=1e-4, load_motor=0.05, load_external=0.05)
+    with_friction = [dataclasses.replace(motor, friction=friction) for motor in motors]
+    assert validate_model(wheels(with_friction), quick=True).passed
+
+
+def test_a_disabled_motor_takes_nothing_from_its_supply():
+    motors = [motor_of(n, SharedSupply(12.0, 0.5)) for n in range(2)]
+    model, alone = wheels(motors), wheels(motors[1:])
+    model.actuator_group[:] = 1, 2
+    model.opt.disableactuator = 1 << 1
+    _, both = run(model, 2.0, 20.0)
+    _, single = run(alone, 2.0, 20.0)
+    for name in SharedDrive.Signals._fields:
+        np.testing.assert_array_equal(both[name][:, 1:], single[name], err_msg=name)
+    assert not both["current"][:, 0].any()

@@ -237,7 +237,10 @@ def torque_range(
     not subtracted.
     """
     if isinstance(actuator, PwmServo):
-        actuator = Drive(actuator.motor, supply=actuator.supply)
+        # At the largest duty cycle d the motor gets d*(V - d*r*i) of the supply.
+        duty = actuator.loop.max_duty
+        supply = Supply(duty * actuator.voltage_limit, duty * duty * actuator.supply_resistance)
+        actuator = Drive(actuator.motor, supply=supply)
     if isinstance(actuator, Drive):
         no_friction: dict[str, float | None] = {
             f"motor.{name}": 0.0

@@ -5,8 +5,19 @@ import math
 import re
 
 import numpy as np
+import pytest
 
-from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Inputs, Motor, Supply, parameters_type
+from codrl_mj.actuators import (
+    CurrentLoop,
+    DCMotorActuator,
+    GearMotor,
+    Inputs,
+    Motor,
+    PwmLoop,
+    PwmServo,
+    Supply,
+    parameters_type,
+)
 from codrl_mj.cli import main
 from codrl_mj.sizing import describe_motor, drive_limits, find_drive
 from codrl_mj.viz.pages.diagrams import no_load_speed, torque_range, torque_speed_diagram
@@ -51,6 +62,14 @@ def test_torque_range_before_friction_ends_at_the_no_load_speed():
     assert high[0] == np.float64(motor.torque_constant * drive.voltage_limit / motor.resistance)
     assert abs(high[1]) < 1e-12
     assert low[0] == -high[0]
+
+
+def test_torque_range_of_a_pwm_servo_is_that_of_its_largest_duty_cycle():
+    servo = PwmServo(GearMotor(), PwmLoop(max_duty=0.5), Supply(12.0, 1.0))
+    motor = servo.motor
+    expected = 0.5 * 12.0 * motor.torque_constant / (motor.resistance + 0.5**2 * 1.0)
+    low, high = torque_range(servo, np.array([0.0]))
+    assert (low[0], high[0]) == pytest.approx((-expected, expected))
 
 
 def test_torque_range_with_a_supply_is_where_the_motor_settles():
