@@ -40,7 +40,10 @@ COMPILED = {
         "VoltageDriven",
         "Drive",
         "VoltageDrive",
+        "SharedDrive",
+        "SharedVoltageDrive",
         "Servo",
+        "PwmServo",
         "Lag",
         "TorqueSpeed",
     )
