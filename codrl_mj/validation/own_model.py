@@ -298,11 +298,7 @@ EXAMPLES: tuple[ActuatorModel, ...] = (
     Lag(time_constant=0.03, delay=0.013),
     TorqueSpeed(stall_torque=0.2, no_load_speed=1.0, max_torque=0.2),
     Drive(GearMotor(gear_ratio=3.0), SampledLoop(sample_rate=10e3, max_current=4.0), Supply(6.0)),
-    SharedDrive(
-        GearMotor(gear_ratio=3.0),
-        SampledLoop(sample_rate=10e3, max_current=4.0),
-        SharedSupply(6.0, 0.5),
-    ),
+    SharedDrive(GearMotor(gear_ratio=3.0), SampledLoop(10e3), SharedSupply(6.0, 2.0)),
     PwmServo(
         GearMotor(gear_ratio=3.0),
         PwmLoop(
