@@ -1,6 +1,7 @@
 """Servos in `codrl-mj motor show`: flags that make a motor a servo, and the servo's responses."""
 
 import dataclasses
+import math
 from typing import Literal
 
 import tyro
@@ -9,7 +10,13 @@ from codrl_mj.actuators import ActuatorSetting, PwmServo, Servo
 from codrl_mj.actuators.firmware import FIRMWARES
 from codrl_mj.boundary import Json
 from codrl_mj.cli.terminal import format_number, print_table, print_text
-from codrl_mj.sizing.servo_response import AMPLITUDE, STEP, PositionServo, ServoResponse
+from codrl_mj.sizing.servo_response import (
+    AMPLITUDE,
+    STEP,
+    PositionServo,
+    ServoResponse,
+    max_lifted_load,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,6 +29,10 @@ class ServoSettings:
     """
     position_p: float | None = None
     """Register P of a pwm_servo."""
+    firmware: str | None = None
+    """Product line of a pwm_servo, such as feetech-sts or dynamixel-x, which gives register P its
+    meaning; motors of the catalogue know theirs.
+    """
     stiffness: float | None = None
     """Position gain of a pwm_servo in torque per error [N*m/rad]."""
     inertia: float | None = None
@@ -29,7 +40,11 @@ class ServoSettings:
 
     def setting(self, name: str) -> ActuatorSetting:
         """Return the setting of the named actuator with these values."""
-        values = {"position_p": self.position_p, "stiffness": self.stiffness}
+        values = {
+            "position_p": self.position_p,
+            "firmware": self.firmware,
+            "stiffness": self.stiffness,
+        }
         loop = {key: value for key, value in values.items() if value is not None}
         if self.family is None and not loop:
             return name
@@ -67,7 +82,7 @@ def print_servo(servo: PositionServo, response: ServoResponse | None) -> dict[st
     print_text(position_gain_text(servo))
     if response is None:
         return {}
-    rows = servo_rows(response)
+    rows = servo_rows(servo, response)
     load = f"with a load of {response.inertia:.3g} kg*m^2" if response.inertia else "without a load"
     cells = [(name, format_number(value, 3), unit) for name, value, unit in rows]
     print_table(f"The servo {load}", ("number", "value", "unit"), cells, right=("value",))
@@ -76,16 +91,20 @@ def print_servo(servo: PositionServo, response: ServoResponse | None) -> dict[st
     return {"servo": {"units": units, "inertia": response.inertia, **values}}
 
 
-def servo_rows(response: ServoResponse) -> list[tuple[str, float, str]]:
+def servo_rows(servo: PositionServo, response: ServoResponse) -> list[tuple[str, float, str]]:
     """Return the names, values and units of a servo's responses."""
     half = 0.5 * response.max_torque
+    lifted = max_lifted_load(servo, response)
+    # Friction that depends on the load leaves no single number.
+    load = [] if math.isnan(lifted) else [("largest load that it lifts", lifted, "N*m")]
     return [
         (f"rise time, {STEP:g} rad, 10 to 90 %", response.rise_time, "s"),
         ("settled to 2 % in", response.settling_time, "s"),
         ("overshoot", response.overshoot, ""),
         ("error that remains", response.final_error, "rad"),
         ("stiffness", response.stiffness, "N*m/rad"),
-        ("largest torque at rest", response.max_torque, "N*m"),
-        ("error under half of it", half / response.stiffness, "rad"),
+        *load,
+        ("largest torque at rest, without friction", response.max_torque, "N*m"),
+        ("error under half of it, without friction", half / response.stiffness, "rad"),
         (f"bandwidth, {AMPLITUDE:g} rad", response.bandwidth, "Hz"),
     ]

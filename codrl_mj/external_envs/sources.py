@@ -227,4 +227,14 @@ def _wrap(target: object, name: str | None) -> ExternalEnvSource | None:
 
 
 # The cache returns the same source for the same id, whose action space is then also cached.
-SOURCE_KINDS.append(SourceKind(_claims, functools.cache(GymnasiumEnvSource), _wrap))
+_cached_source = functools.cache(GymnasiumEnvSource)
+
+
+def _find(name: str) -> GymnasiumEnvSource:
+    """Return the source of an id; importing its module needs permission even if it is cached."""
+    if ":" in name:
+        load_module(name)
+    return _cached_source(name)
+
+
+SOURCE_KINDS.append(SourceKind(_claims, _find, _wrap))

@@ -155,6 +155,17 @@ def _max_torque(servo: PositionServo) -> float:
     return min(torque, servo.loop.max_torque) if isinstance(servo, Servo) else torque
 
 
+def max_lifted_load(servo: PositionServo, response: ServoResponse) -> float:
+    """Return the largest load [N*m] that a servo lifts at standstill, against friction and gear.
+
+    It is NaN if the servo has the part `friction`, which depends on the load.
+    """
+    if servo.friction is not None:
+        return math.nan
+    moved = response.max_torque * servo.motor.gear_efficiency - servo.additions.friction
+    return max(moved, 0.0)
+
+
 def _crossing(gains: np.ndarray, index: int) -> float:
     """Return the frequency [Hz] before an index at which a gain falls below 1/sqrt(2)."""
     if index == 0:

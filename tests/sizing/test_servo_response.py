@@ -7,10 +7,19 @@ import math
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import GearMotor, PwmLoop, PwmServo, SampledLoop, Servo, ServoLoop, Supply
+from codrl_mj.actuators import (
+    GearMotor,
+    PwmLoop,
+    PwmServo,
+    SampledLoop,
+    Servo,
+    ServoFriction,
+    ServoLoop,
+    Supply,
+)
 from codrl_mj.cli import main
 from codrl_mj.sizing import analyze_servo, find_drive, find_servo
-from codrl_mj.sizing.servo_response import FREQUENCIES, STEP
+from codrl_mj.sizing.servo_response import FREQUENCIES, STEP, max_lifted_load
 from codrl_mj.viz.pages.servo_diagrams import servo_plots, steady_errors
 
 MOTOR = GearMotor(
@@ -93,6 +102,19 @@ def test_friction_and_losses_of_the_gear_shift_the_sag():
     assert lowering.y[10] == pytest.approx((load - friction) * 0.8 / servo.stiffness, rel=1e-9)
 
 
+def test_the_largest_load_that_an_sts3215_lifts_is_its_printed_stall_torque_at_full_duty():
+    """Its gear passes on 64 % of the motor's torque, which without friction looks much larger."""
+    servo = find_servo(
+        {"name": "feetech-sts3215-7v4", "family": "pwm_servo"}, find_drive("feetech-sts3215-7v4")
+    )
+    response = analyze_servo(servo)
+    # 19.5 kg*cm at 7.4 V; the largest duty cycle is 0.97, and friction takes its share in full.
+    assert max_lifted_load(servo, response) == pytest.approx(0.97 * 1.912, rel=3e-3)
+    assert response.max_torque > 3.0
+    rubbing = dataclasses.replace(PWM, friction=ServoFriction(base=0.1))
+    assert math.isnan(max_lifted_load(rubbing, response))
+
+
 STS = "motor show feetech-sts3215-7v4 --family pwm_servo --position-p 16 --inertia 0.01"
 
 
@@ -118,6 +140,12 @@ def test_motor_show_reports_a_servo_as_json(capsys):
     assert servo["stiffness"] == pytest.approx(expected.stiffness)
     assert servo["units"]["stiffness"] == "N*m/rad"
     assert servo["inertia"] == 0.01
+
+
+def test_a_register_of_another_motor_is_shown_with_its_firmware(capsys):
+    words = "motor show maxon-re65 --family pwm_servo --position-p 32 --firmware feetech-sts"
+    assert main(words.split()) == 0
+    assert "P = 32 of feetech-sts" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_register_of_an_unknown_firmware_is_refused(capsys):
