@@ -31,7 +31,7 @@ class ServoSettings:
     """Register P of a pwm_servo."""
     firmware: str | None = None
     """Product line of a pwm_servo, such as feetech-sts or dynamixel-x, which gives register P its
-    meaning; motors of the catalogue know theirs.
+    meaning; for a motor of the catalogue it is known.
     """
     stiffness: float | None = None
     """Position gain of a pwm_servo in torque per error [N*m/rad]."""

@@ -55,7 +55,7 @@ def advance_in_python(
 def advance_supply(motors: Sequence[SharingMotor], timestep: float) -> list[Advanced]:
     """Advance the drives of a supply by a step [s], sample by sample."""
     supply = motors[0].parameters
-    begun = [
+    started = [
         equations.begin_step(
             motor.parameters,
             timestep,
@@ -66,7 +66,7 @@ def advance_supply(motors: Sequence[SharingMotor], timestep: float) -> list[Adva
         )
         for motor in motors
     ]
-    steps, pieces, sampled = (list(parts) for parts in zip(*begun, strict=True))
+    steps, pieces, sampled = (list(parts) for parts in zip(*started, strict=True))
     averages = [StepAverages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)] * len(motors)
     samples = max(int(timestep * supply.sample_rate + 0.5), 1)
     volts, amperes = 0.0, 0.0

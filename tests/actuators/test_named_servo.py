@@ -225,9 +225,9 @@ def test_a_servo_in_a_file_is_shown_with_its_motor_and_loops(capsys, files):
 @pytest.mark.parametrize("family", ["shared_drive", "servo", "pwm_servo"])
 def test_another_family_keeps_the_supply_and_goes_back(family):
     drive = Drive(supply=Supply(48.0, 0.1), friction=ServoFriction(base=0.2))
-    other = override_actuator(drive, {"family": family})
-    assert (other.supply.voltage, other.supply.resistance) == (48.0, 0.1)
-    assert override_actuator(other, {"family": "drive"}) == drive
+    changed = override_actuator(drive, {"family": family})
+    assert (changed.supply.voltage, changed.supply.resistance) == (48.0, 0.1)
+    assert override_actuator(changed, {"family": "drive"}) == drive
     nominal = resolve(MOTOR, None, "x").supply.voltage
     assert resolve({"name": MOTOR, "family": family}, None, "x").supply.voltage == nominal
 

@@ -293,10 +293,10 @@ def test_jitter_moves_each_arrival_and_repeats_with_its_key():
     actuator = servo(command_rate=50.0, command_delay=0.02, command_jitter=0.003, servo_rate=500.0)
     commands = (np.arange(20_000) // 10).astype(float)
     first = arrivals(actuator, commands)
-    lates = np.array([np.argmax(first == number) - 10 * number for number in range(1, 1900)])
+    delays = np.array([np.argmax(first == number) - 10 * number for number in range(1, 1900)])
     # An arrival is seen at the next step, half a step later on average.
-    assert lates.mean() * 0.002 == pytest.approx(0.021, abs=3e-4)
-    assert lates.std() * 0.002 == pytest.approx(math.hypot(0.003, 0.002 / math.sqrt(12)), rel=0.06)
+    assert delays.mean() * 0.002 == pytest.approx(0.021, abs=3e-4)
+    assert delays.std() * 0.002 == pytest.approx(math.hypot(0.003, 0.002 / math.sqrt(12)), rel=0.06)
     np.testing.assert_array_equal(first, arrivals(actuator, commands))
     assert (first != arrivals(actuator, commands, noise_key=8.0)).any()
 

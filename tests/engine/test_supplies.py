@@ -276,11 +276,11 @@ def test_the_certificate_runs_the_motors_of_a_supply_together():
 
 def test_a_disabled_motor_takes_nothing_from_its_supply():
     motors = [motor_of(n, SharedSupply(12.0, 0.5)) for n in range(2)]
-    model, alone = wheels(motors), wheels(motors[1:])
+    model, remaining = wheels(motors), wheels(motors[1:])
     model.actuator_group[:] = 1, 2
     model.opt.disableactuator = 1 << 1
     _, both = run(model, 2.0, 20.0)
-    _, single = run(alone, 2.0, 20.0)
+    _, single = run(remaining, 2.0, 20.0)
     for name in SharedDrive.Signals._fields:
         np.testing.assert_array_equal(both[name][:, 1:], single[name], err_msg=name)
     assert not both["current"][:, 0].any()
