@@ -28,7 +28,7 @@ CORE_MODULES = {
     *("engine", "engine.joint_dynamics", "engine.matching", "engine.shafts"),
     *("envs", "envs.distributions", "envs.motor_fields", "envs.patterns", "runs", "runs.files"),
     *("sizing", "sizing.choice", "sizing.feasibility", "sizing.joint_demand", "sizing.limits"),
-    *("sizing.loop", "sizing.swing"),
+    *("sizing.loop", "sizing.servo_response", "sizing.swing"),
 }
 """Further modules of this kind, in packages that have others too."""
 DISTRIBUTIONS = {"PIL": "pillow", "serial": "pyserial"}
