@@ -119,7 +119,7 @@ def test_the_short_help_has_every_flag_and_half_the_lines(capsys):
         re.findall(r" --[a-z][\w.-]+", f" {short} --actuators ")
     )
     assert "--help-verbose" in short
-    assert short.count("\n") < long.count("\n") / 2
+    assert short.count("\n") < 164  # --help prints 329 lines
 
 
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if hasattr(find_verb(verb), "as_json")])
