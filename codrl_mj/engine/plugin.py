@@ -62,7 +62,8 @@ REASONS = (
     "its actuator's user data do not begin with codrl_mj's signature, family and arm",
     "the family of its actuator's user data is not loaded",
     "its configuration and its actuator's user data name different families",
-    "its actuator's user data have fewer numbers than the family has parameters",
+    "its actuator's user data have fewer numbers than the family has parameters; if an earlier"
+    " version saved the model, add the motors again",
     "it was compiled when the family had another number of states or signals",
     "several of its actuators have a motor's user data, but only one may have them",
 )
