@@ -61,7 +61,7 @@ def test_a_known_resistance_and_viscous_friction_leave_no_common_factor():
 
 
 def test_a_free_swing_shows_only_the_ratio_of_weight_and_inertia():
-    """The period of a small swing is 2 pi sqrt(J/mgl), whatever the two are."""
+    """A small swing has the period 2 pi sqrt(J/mgl), which depends only on the ratio of J and mgl."""
     time = 2e-3 * np.arange(1500)
     shaft = ShaftParameters(0.05, 3.2, 0.0, 0.0, 0.01, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
     position = simulate_shaft(time, 0.0 * time, 0.0 * time, 1.0, 0.0, shaft)[0]
