@@ -148,6 +148,36 @@ def end_step(
     ), shaft.temperature_of(parameters, heat)
 
 
+def step_signals(
+    parameters: Parameters,
+    command: float,
+    reference: float,
+    closed: bool,
+    temperature: float,
+    averages: StepAverages,
+    saturated: float,
+) -> tuple[float, ...]:
+    """Return the entries of `Signals` for a step in which a number of samples was saturated.
+
+    `command` and `reference` are the current [A] before and after its limits, or without a loop
+    both the same value. The averages are over the step, and the temperature [degC] is at its end.
+    """
+    is_limited, is_thermal = reference != command, abs(reference) < parameters.max_current
+    # A plain tuple, because numba does not add entries to a named one.
+    return (
+        averages.current,
+        reference if closed else averages.current,
+        averages.voltage,
+        temperature,
+        1.0 if saturated > 0.0 or is_limited else 0.0,
+        1.0 if saturated > 0.0 else 0.0,
+        1.0 if is_limited and not is_thermal else 0.0,
+        1.0 if is_limited and is_thermal else 0.0,
+        averages.power,
+        averages.heat,
+    )
+
+
 def _advance(
     parameters: Parameters, timestep: float, state: State, inputs: Inputs, closed: bool
 ) -> tuple[State, float, Signals]:
@@ -168,21 +198,10 @@ def _advance(
     after, temperature = end_step(
         parameters, timestep, inputs.time, heat, resistance, winding, rotor, averages
     )
-    reported = reference if closed else averages.current
-    is_limited, is_thermal = reference != command, abs(reference) < parameters.max_current
-    signals = Signals(
-        averages.current,
-        reported,
-        averages.voltage,
-        temperature,
-        1.0 if averages.saturated > 0.0 or is_limited else 0.0,
-        1.0 if averages.saturated > 0.0 else 0.0,
-        1.0 if is_limited and not is_thermal else 0.0,
-        1.0 if is_limited and is_thermal else 0.0,
-        averages.power,
-        averages.heat,
+    signals = step_signals(
+        parameters, command, reference, closed, temperature, averages, averages.saturated
     )
-    return State(*after), averages.torque, signals
+    return State(*after), averages.torque, Signals(*signals)
 
 
 def advance(

@@ -30,7 +30,7 @@ from codrl_mj.actuators.pwm_loop import (
     advance_loop,
     command_in_force,
 )
-from codrl_mj.actuators.servo_friction import ServoFriction, has_servo_friction
+from codrl_mj.actuators.servo_friction import ServoFriction
 from codrl_mj.actuators.shaft import Shaft, TemperatureRises
 from codrl_mj.fields import optional_nested
 
@@ -194,14 +194,7 @@ def advance_motor(
     speed, as in `shaft.advance_motor`.
     """
     viscous = parameters.viscous_friction
-    braking = (
-        parameters.torque_constant * parameters.back_emf_constant / resistance
-        + viscous
-        + parameters.friction_viscous / (parameters.gear_ratio * parameters.gear_ratio)
-    )
-    pieces = min(max(math.ceil(2.0 * duration * braking / rotor.inertia), 1), MAX_PIECES)
-    has_losses = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
-    is_servo = has_servo_friction(parameters)
+    pieces = shaft.pieces_of_step(parameters, resistance, duration, MAX_PIECES, rotor.inertia)
     current, speed = motion.current, motion.speed
     mean, mean_square, torque = 0.0, 0.0, 0.0
     piece = duration / pieces
@@ -209,10 +202,7 @@ def advance_motor(
         driven = advance_winding(parameters, resistance, piece, current, duty, speed)
         current, delivered = driven.current, parameters.torque_constant * driven.mean
         now = Shaft(rotor.inertia, rotor.external_acceleration, speed)
-        if has_losses:
-            delivered -= shaft.friction(parameters, piece, delivered, now)
-        elif is_servo:
-            delivered -= shaft.servo_friction(parameters, piece, delivered, now)
+        delivered -= shaft.lost_torque(parameters, piece, delivered, now)
         mean += driven.mean / pieces
         mean_square += driven.mean_square / pieces
         torque += delivered / pieces

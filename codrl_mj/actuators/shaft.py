@@ -206,6 +206,15 @@ def servo_friction(parameters: Parameters, duration: float, torque: float, shaft
     return at_output / ratio
 
 
+def lost_torque(parameters: Parameters, duration: float, torque: float, shaft: Shaft) -> float:
+    """Return what gear and friction take of the motor's torque [N*m]; friction of the joint not."""
+    if parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0:
+        return friction(parameters, duration, torque, shaft)
+    if has_servo_friction(parameters):
+        return servo_friction(parameters, duration, torque, shaft)
+    return 0.0
+
+
 def has_thermal_model(parameters: Parameters) -> bool:
     """Return True if the motor's temperature can change."""
     return parameters.thermal_resistance_winding + parameters.thermal_resistance_housing > 0.0
@@ -353,8 +362,6 @@ def advance_motor(
     # speed. So only the change since then is added.
     viscous = parameters.viscous_friction
     pieces = pieces_of_step(parameters, resistance, duration, samples, shaft.inertia)
-    has_losses = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
-    is_servo = has_servo_friction(parameters)
     amperes, volts, torque, power, heat = 0.0, 0.0, 0.0, 0.0, 0.0
     saturated, samples_left, speed = 0, samples, shaft.speed
     for piece in range(pieces):
@@ -365,10 +372,7 @@ def advance_motor(
         samples_left, saturated = samples_left - count, saturated + limited
         share, delivered = count / samples, parameters.torque_constant * mean
         shaft_now = Shaft(shaft.inertia, shaft.external_acceleration, speed)
-        if has_losses:
-            delivered -= friction(parameters, share * duration, delivered, shaft_now)
-        elif is_servo:
-            delivered -= servo_friction(parameters, share * duration, delivered, shaft_now)
+        delivered -= lost_torque(parameters, share * duration, delivered, shaft_now)
         amperes = amperes + share * mean
         volts = volts + share * voltage
         torque = torque + share * delivered

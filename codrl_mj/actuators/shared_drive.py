@@ -32,7 +32,6 @@ from codrl_mj.actuators.model import (
 )
 from codrl_mj.actuators.parameters import Parameters
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
-from codrl_mj.actuators.servo_friction import has_servo_friction
 from codrl_mj.actuators.shaft import Shaft, StepAverages, Winding
 from codrl_mj.catalogue import MotorParameters
 from codrl_mj.fields import flag, integer, optional_nested
@@ -276,10 +275,7 @@ def _end_piece(
     )
     delivered, viscous = parameters.torque_constant * mean, parameters.viscous_friction
     rotor = Shaft(step.inertia, step.external_acceleration, piece.speed)
-    if parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0:
-        delivered -= shaft.friction(parameters, share * timestep, delivered, rotor)
-    elif has_servo_friction(parameters):
-        delivered -= shaft.servo_friction(parameters, share * timestep, delivered, rotor)
+    delivered -= shaft.lost_torque(parameters, share * timestep, delivered, rotor)
     net_torque = delivered - viscous * (piece.speed - step.initial_speed)
     acceleration = net_torque / step.inertia + step.external_acceleration
     return StepAverages(
@@ -311,23 +307,12 @@ def end_step(
         parameters, timestep, inputs.time, heat, step.resistance, winding, rotor, averages
     )
     command = inputs.desired_torque / parameters.torque_constant
-    is_limited = step.reference != command
-    is_thermal = abs(step.reference) < parameters.max_current
-    signals = Signals(
-        averages.current,
-        step.reference if closed else averages.current,
-        averages.voltage,
-        temperature,
-        1.0 if motor.saturated > 0.0 or is_limited else 0.0,
-        1.0 if motor.saturated > 0.0 else 0.0,
-        1.0 if is_limited and not is_thermal else 0.0,
-        1.0 if is_limited and is_thermal else 0.0,
-        averages.power,
-        averages.heat,
-        volts,
-        amperes,
+    signals = drive.step_signals(
+        parameters, command, step.reference, closed, temperature, averages, motor.saturated
     )
-    return State(*after), averages.torque, signals
+    # mypy does not know the number of a drive's signals.
+    all_signals = Signals(*signals, volts, amperes)  # type: ignore[call-arg]
+    return State(*after), averages.torque, all_signals
 
 
 def _advance(

@@ -101,7 +101,7 @@ class Identify:
         from codrl_mj.identify.identify import check_arguments, identify, predict_missing
         from codrl_mj.identify.log import assign_log_roles
         from codrl_mj.identify.reading import read_log
-        from codrl_mj.identify.result import ACTUATOR, JOINT
+        from codrl_mj.identify.result import JOINT
         from codrl_mj.sizing import find_drive
 
         logs, held_out = (
@@ -133,14 +133,7 @@ class Identify:
         print_identification(result)
         problem = result.problem()
         if self.out is not None:
-            if problem is not None and (self.out / ACTUATOR).exists():
-                print(
-                    f"removed {self.out / ACTUATOR}: it was from an earlier fit, and this fit has"
-                    " no actuator"
-                )
-            for path in result.write(self.out):
-                print(f"wrote {path}")
-            write_page(result, self.out / "report.html")
+            write_files(result, self.out)
         units = {estimate.name: estimate.unit for estimate in result.estimates}
         has_result = problem is None or result.joint_text is not None
         return int(not has_result), result.as_mapping() | {"units": units}
@@ -176,6 +169,19 @@ class Identify:
                 style="yellow",
             )
         return [log for log in held_out if not any(log is bad_log for bad_log in bad_logs)]
+
+
+def write_files(result: Identified, folder: Path) -> None:
+    """Write the files and the page of an identification, and print their names."""
+    from codrl_mj.identify.result import ACTUATOR
+
+    if result.problem() is not None and (folder / ACTUATOR).exists():
+        print(
+            f"removed {folder / ACTUATOR}: it was from an earlier fit, and this fit has no actuator"
+        )
+    for path in result.write(folder):
+        print(f"wrote {path}")
+    write_page(result, folder / "report.html")
 
 
 def write_page(result: Identified, page: Path) -> None:

@@ -11,7 +11,7 @@ from codrl_mj.cli.identify import (
     Logs,
     print_findings,
     print_identification,
-    write_page,
+    write_files,
 )
 from codrl_mj.cli.parsing import AsJson, Output, parse_named_numbers
 from codrl_mj.cli.terminal import progress_bar
@@ -62,7 +62,6 @@ class IdentifyServo:
     def run(self) -> Output:
         """Check the logs, fit the servo, print a table, and write the files."""
         from codrl_mj.identify.reading import read_log
-        from codrl_mj.identify.result import ACTUATOR
         from codrl_mj.identify.servo import identify_servo
 
         logs, held_out = (
@@ -87,14 +86,7 @@ class IdentifyServo:
         print_identification(result)
         problem = result.problem()
         if self.out is not None:
-            if problem is not None and (self.out / ACTUATOR).exists():
-                print(
-                    f"removed {self.out / ACTUATOR}: it was from an earlier fit, and this fit has"
-                    " no actuator"
-                )
-            for path in result.write(self.out):
-                print(f"wrote {path}")
-            write_page(result, self.out / "report.html")
+            write_files(result, self.out)
         units = {estimate.name: estimate.unit for estimate in result.estimates}
         return int(problem is not None), result.as_mapping() | {"units": units}
 
