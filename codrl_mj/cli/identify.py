@@ -55,8 +55,9 @@ class Identify:
     actuator and --env.randomize identified draws the parameters from their intervals. If an
     actuator needs a parameter that the logs do not determine, there is no actuator.yaml and the
     exit status is 1, until you give its value with --known. Logs of a torque give a joint.yaml
-    instead: friction, damping and armature for --actuator ideal. See also codrl-mj identify check,
-    plan and simulate, which prepare a fit, and docs/identify.md.
+    instead: friction, damping and armature for --actuator ideal. codrl-mj identify servo fits a
+    position servo to its commands and positions. See also codrl-mj identify check, plan and
+    simulate, which prepare a fit, and docs/identify.md.
 
     Example: codrl-mj identify swing1.csv swing2.csv --columns
     time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad --rig pendulum --known mgl=2.81
